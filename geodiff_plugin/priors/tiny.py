@@ -33,13 +33,7 @@ def _latent_of(vae: Any) -> tuple[int | None, int | None]:
 def tiny_autoencoder(pipe: Any, decoder: str) -> AutoencoderTiny | None:
     """The autoencoder for the loop, on the pipeline's device and of its dtype, frozen; ``None`` for its own.
 
-    Args:
-        pipe: the live pipeline.
-        decoder: as in ``GuidanceConfig``.
-
-    Raises:
-        InputError: a prior without latents, or without a known tiny autoencoder; a folder that holds none, or
-            one of another latent; a hub id that is neither cached nor reachable.
+    ``decoder`` is that of ``GuidanceConfig``; what cannot decode the pipeline's latent is an ``InputError``.
     """
     if decoder == FULL:
         return None

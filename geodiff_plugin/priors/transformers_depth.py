@@ -80,12 +80,9 @@ class Preparation:
             bad_value(f"size {file}", "a number or a height and a width", size)
 
     def _grid(self, height: int, width: int) -> tuple[tuple[int, int], tuple[int, int], list[int]]:
-        """How an image is laid out for the network.
+        """Rows and columns at each side that ZoeDepth reflects before it resizes; ``(h, w)`` after that.
 
-        Returns:
-            Rows above and below, and columns left and right, that ZoeDepth reflects before it resizes; sides
-            ``(h, w)`` after resizing; left, right, top, bottom zeros after normalising, to a multiple of a
-            patch (``PADDED_LAST``).
+        And left, right, top, bottom zeros after normalising, to a multiple of a patch (``PADDED_LAST``).
         """
         options, rows, columns = self.options, 0, 0
         if self.kind == "ZoeDepth" and options["do_pad"]:
@@ -211,14 +208,9 @@ class TransformersDepthPipeline(DirectMapPipeline):
     the longer side of that map, 0 for the image's own; ``preprocessor_config.json`` says at which size the
     network then works.
 
-    Args:
-        model: the network.
-        scheduler: one step whose result is what it is given.
-        preparation: contents of ``preprocessor_config.json``; needed.
-        prediction_type: ``"depth"`` or ``"disparity"``; ``None`` for what the model's class is known to give.
-
-    Attributes:
-        metric: whether its maps are in metres (inverse metres in disparity space) without a prompt.
+    ``preparation`` are the contents of that file; ``prediction_type`` is ``"depth"`` or ``"disparity"``, or
+    ``None`` for what the model's class is known to give; ``metric`` says whether maps are in metres (inverse
+    metres in disparity space) without a prompt.
     """
 
     model_cpu_offload_seq = "model"
@@ -283,17 +275,10 @@ class TransformersDepthPipeline(DirectMapPipeline):
 
     @torch.no_grad()
     def predict(self, image_01: Tensor, size: tuple[int, int], prompt_m: Tensor | None = None) -> Tensor:
-        """What the model says, in its own unit and not clipped.
+        """What the model says of images in [0, 1], in its own unit and not clipped, ``(B, 1, h, w)`` float32.
 
-        Args:
-            image_01: ``(B, 3, H, W)`` in [0, 1], on the model's device.
-            size: sides ``(h, w)`` of the map.
-            prompt_m: ``(B, 1, h', w')`` metres everywhere, of any size, for a model that takes a prompt; its
-                map is in metres then.
-
-        Returns:
-            ``(B, 1, h, w)`` float32 over the image without what was padded, resampled as the library's
-            ``post_process_depth_estimation`` does.
+        Resampled to ``size`` as the library's ``post_process_depth_estimation``, without what was padded.
+        With ``prompt_m (B, 1, h', w')``, metres everywhere, of a model that takes a prompt, it is in metres.
         """
         told: dict[str, Tensor] = {}
         low, span = image_01.new_zeros(1), image_01.new_ones(1)

@@ -83,8 +83,8 @@ class StepEstimate:
     Args:
         codec: between latents and maps.
         level: signal and noise of the step.
-        output: ``(B, C, h, w)`` the network's, all channels, in the pipeline's precision.
-        z_t: the noisy latent, likewise.
+        output: ``(B, C, h, w)`` the network's, all channels, in the pipeline's precision, as ``z_t``.
+        z_t: the noisy latent.
         tap: of the network for the full gradient; ``None`` where guidance moves the clean latent.
         latent_is_read: another step follows, or the user asked for the latent; else a last map needs no code.
 
