@@ -1,4 +1,4 @@
-"""Metric depth from a calibrated stereo pair, in a plain diffusers script with two lines more.
+"""Metric depth from a calibrated stereo pair: a plain diffusers script with two additional lines.
 
 Without arguments it runs offline, on the rendered pair and the small prior of the package:
 
@@ -18,7 +18,6 @@ from PIL import Image, ImageOps
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from geodiff_plugin.plotting import depth_figure
-
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
@@ -55,7 +54,6 @@ def main(argv: list[str] | None = None) -> None:
     )
     for sentence in out.warnings:
         print(f"warning: {sentence}")
-
 
 if __name__ == "__main__":
     main()

@@ -1,7 +1,7 @@
 """Depth from known points: guided, and as Marigold V2's authors do it, by a LoRA fitted to every image.
 
-Their way takes 100 Adam steps through the transformer for each image; the guided call takes one pass. Without
-a folder it runs on a tiny prior with random weights, which shows the path and no depth worth having:
+The fit takes 100 Adam steps through the transformer for each image; the guided call takes one pass. Without a
+folder the script runs on a tiny prior with random weights, whose depth means nothing:
 
     python -m examples.fitted_lora --points 500
     python -m examples.fitted_lora --points 500 --prior marigold-v2 --device cuda
@@ -36,10 +36,9 @@ TARGETS = re.compile(
     r"|(img|txt)_mlp\.net\.(0\.proj|2))"
 )
 
-
 @dataclass(frozen=True)
 class FittedLora:
-    """Their hyperparameters.
+    """Hyperparameters of the fit, by default those of the authors.
 
     Attributes:
         steps: of Adam.
@@ -56,7 +55,6 @@ class FittedLora:
     rate: float = 1e-3
     rate_affine: float = 0.03
     seed: int = 0
-
 
 @contextmanager
 def _adapter(transformer: torch.nn.Module, options: FittedLora) -> Iterator[list[Tensor]]:
@@ -84,12 +82,10 @@ def _adapter(transformer: torch.nn.Module, options: FittedLora) -> Iterator[list
         for hook in hooks:
             hook.remove()
 
-
 def _least_squares(relative: Tensor, log_depth: Tensor) -> tuple[Tensor, Tensor]:
     """Scale and shift of log depth at the points."""
     design = torch.stack([relative.double(), torch.ones_like(relative.double())], 1)
     return torch.linalg.lstsq(design, log_depth.double()[:, None]).solution[:, 0].float().unbind()
-
 
 def complete_by_lora(
     pipe: MarigoldV2Pipeline,
@@ -146,7 +142,6 @@ def complete_by_lora(
         for parameter, flag in zip(weights, flags, strict=True):
             parameter.requires_grad_(flag)
 
-
 def _fit(
     relative: Any, parameters: list[Tensor], known: Tensor, target: Tensor, options: FittedLora
 ) -> Tensor:
@@ -177,10 +172,8 @@ def _fit(
     with torch.no_grad():
         return metres(a, b)
 
-
 #: Longer side at which the tiny prior works; a folder's own default otherwise.
 TINY_RESOLUTION = 192
-
 
 @dataclass(frozen=True)
 class Completion:
@@ -200,7 +193,6 @@ class Completion:
     mae_m: float
     abs_rel: float
 
-
 def draw_points(pair: DemoPair, count: int, seed: int = 0) -> np.ndarray:
     """``(H, W)`` metres with ``count`` pixels of the truth, 0 elsewhere."""
     rows, columns = np.nonzero(pair.valid)
@@ -208,7 +200,6 @@ def draw_points(pair: DemoPair, count: int, seed: int = 0) -> np.ndarray:
     points = np.zeros_like(pair.depth_m)
     points[rows[chosen], columns[chosen]] = pair.depth_m[rows[chosen], columns[chosen]]
     return points
-
 
 def compare_completions(
     pipe: MarigoldV2Pipeline, pair: DemoPair, points: np.ndarray, resolution: int, options: FittedLora
@@ -258,7 +249,6 @@ def compare_completions(
     counter.remove()
     return found
 
-
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -285,7 +275,6 @@ def main(argv: list[str] | None = None) -> None:
     for way in compare_completions(pipe, pair, points, resolution, FittedLora()):
         numbers = f"{way.seconds:>9.2f}{way.passes:>8}{way.mae_m:>9.3f}{way.abs_rel:>9.3f}"
         print(f"{way.name:<34}{numbers}", flush=True)
-
 
 if __name__ == "__main__":
     main()

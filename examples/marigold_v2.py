@@ -1,7 +1,7 @@
 """Marigold V2 as a prior: one step of a large transformer, made metric by a second view.
 
-``geodiff convert marigold-v2`` makes the folder (docs/reference/priors.md). Without one it runs offline on
-a tiny folder with random weights, which shows the path and no depth worth having:
+``geodiff convert marigold-v2`` makes the folder (docs/reference/priors.md). Without a folder the script runs
+offline on a tiny model with random weights, whose depth means nothing:
 
     python examples/marigold_v2.py
     python examples/marigold_v2.py left.png right.png calib.txt --prior marigold-v2 --device cuda
@@ -34,9 +34,8 @@ TINY_TRANSFORMER = {
 }
 TINY_VAE = {"base_dim": 4, "dim_mult": [1, 2, 4, 4], "num_res_blocks": 1}
 
-
 def tiny_marigold_v2(seed: int = 0, space: str = "log") -> MarigoldV2Pipeline:
-    """A Marigold V2 that has learnt nothing and runs in a blink, float32, at 64 px.
+    """A tiny Marigold V2 with random weights, float32, at 64 px.
 
     Args:
         seed: of the weights.
@@ -58,7 +57,6 @@ def tiny_marigold_v2(seed: int = 0, space: str = "log") -> MarigoldV2Pipeline:
     )
     pipe.set_progress_bar_config(disable=True)
     return pipe
-
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
@@ -93,7 +91,6 @@ def main(argv: list[str] | None = None) -> None:
         print(f"warning: {sentence}")
     np.save(options.out, depth_m)
     print(options.out)
-
 
 if __name__ == "__main__":
     main()

@@ -1,8 +1,8 @@
-"""Two photographs from anywhere: the right camera is turned and moved, nothing is rectified.
+"""Two photographs in a general pose: the right camera is turned and moved, nothing is rectified.
 
 A scene is rendered from two camera-to-world poses, in metres, so the truth is known and the error can be
-printed. (COLMAP writes world-to-camera poses without a unit; docs/reference/calibration.md turns them into
-these.) Runs offline:
+printed. (COLMAP writes world-to-camera poses without a unit; docs/reference/calibration.md shows how to
+convert them.) Runs offline:
 
     python -m examples.posed_photographs --seed 7 --angle 8
 """
@@ -17,7 +17,6 @@ import torch
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
 from tests.scenes import render_pair
 
-
 def world_poses(E: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Camera-to-world poses of both cameras, in a world that is neither of them."""
     angle = np.radians(30.0)
@@ -29,7 +28,6 @@ def world_poses(E: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     ]
     T_world_from_left[:3, 3] = 1.0, -2.0, 0.5
     return T_world_from_left, T_world_from_left @ E
-
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
@@ -60,7 +58,6 @@ def main(argv: list[str] | None = None) -> None:
     error = np.abs(depth_m - truth_m)[known] / truth_m[known]
     print(f"truth {np.median(truth_m[known]):.2f} m, guided {np.median(depth_m):.2f} m (medians)")
     print(f"mean relative error {error.mean():.3f}; {out.visible.mean():.0%} seen by both cameras")
-
 
 if __name__ == "__main__":
     main()
