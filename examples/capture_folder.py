@@ -1,8 +1,8 @@
 """A capture of a moving camera: the poses of a tracker, refined together, and depth of some frames.
 
 Give the folder of a phone's scan (transforms.json), a COLMAP model or any other layout that `geodiff
-capture` reads. Without a folder, a scene is rendered from a moving camera, with poses as inexact as a tracker's,
-so that the error can be printed. Needs the extra `capture`. Runs offline:
+capture` reads. Without a folder, a scene is rendered from a moving camera, with poses as inexact as a
+tracker's, so that the error can be printed. Needs the extra `capture`. Runs offline:
 
     python -m examples.capture_folder [scan/ --frames 0:100:10]
 """
@@ -22,6 +22,7 @@ from tests.scenes.sequences import render_sequence
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
+
 def rendered_scan(folder: Path, size: tuple[int, int], frames: int) -> dict[str, np.ndarray]:
     """Write a transforms.json with images; the true depth by frame."""
     sequence = render_sequence(3, frames, "room", size)
@@ -38,6 +39,7 @@ def rendered_scan(folder: Path, size: tuple[int, int], frames: int) -> dict[str,
     camera |= {"w": size[1], "h": size[0], "frames": said}
     (folder / "transforms.json").write_text(json.dumps(camera))
     return truth
+
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
@@ -69,6 +71,7 @@ def main(argv: list[str] | None = None) -> None:
                 known = np.isfinite(truth[name]) & (truth[name] > 0)
                 line += f", AbsRel {np.mean(np.abs(depth / truth[name] - 1)[known]):.3f}"
             print(line)
+
 
 if __name__ == "__main__":
     main()

@@ -19,6 +19,7 @@ from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prio
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from geodiff_plugin.plotting import depth_figure
 
+
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -54,6 +55,7 @@ def main(argv: list[str] | None = None) -> None:
     )
     for sentence in out.warnings:
         print(f"warning: {sentence}")
+
 
 if __name__ == "__main__":
     main()

@@ -36,6 +36,7 @@ TARGETS = re.compile(
     r"|(img|txt)_mlp\.net\.(0\.proj|2))"
 )
 
+
 @dataclass(frozen=True)
 class FittedLora:
     """Hyperparameters of the fit, by default those of the authors.
@@ -55,6 +56,7 @@ class FittedLora:
     rate: float = 1e-3
     rate_affine: float = 0.03
     seed: int = 0
+
 
 @contextmanager
 def _adapter(transformer: torch.nn.Module, options: FittedLora) -> Iterator[list[Tensor]]:
@@ -82,10 +84,12 @@ def _adapter(transformer: torch.nn.Module, options: FittedLora) -> Iterator[list
         for hook in hooks:
             hook.remove()
 
+
 def _least_squares(relative: Tensor, log_depth: Tensor) -> tuple[Tensor, Tensor]:
     """Scale and shift of log depth at the points."""
     design = torch.stack([relative.double(), torch.ones_like(relative.double())], 1)
     return torch.linalg.lstsq(design, log_depth.double()[:, None]).solution[:, 0].float().unbind()
+
 
 def complete_by_lora(
     pipe: MarigoldV2Pipeline,
@@ -142,6 +146,7 @@ def complete_by_lora(
         for parameter, flag in zip(weights, flags, strict=True):
             parameter.requires_grad_(flag)
 
+
 def _fit(
     relative: Any, parameters: list[Tensor], known: Tensor, target: Tensor, options: FittedLora
 ) -> Tensor:
@@ -172,8 +177,10 @@ def _fit(
     with torch.no_grad():
         return metres(a, b)
 
+
 #: Longer side at which the tiny prior works; a folder's own default otherwise.
 TINY_RESOLUTION = 192
+
 
 @dataclass(frozen=True)
 class Completion:
@@ -193,6 +200,7 @@ class Completion:
     mae_m: float
     abs_rel: float
 
+
 def draw_points(pair: DemoPair, count: int, seed: int = 0) -> np.ndarray:
     """``(H, W)`` metres with ``count`` pixels of the truth, 0 elsewhere."""
     rows, columns = np.nonzero(pair.valid)
@@ -200,6 +208,7 @@ def draw_points(pair: DemoPair, count: int, seed: int = 0) -> np.ndarray:
     points = np.zeros_like(pair.depth_m)
     points[rows[chosen], columns[chosen]] = pair.depth_m[rows[chosen], columns[chosen]]
     return points
+
 
 def compare_completions(
     pipe: MarigoldV2Pipeline, pair: DemoPair, points: np.ndarray, resolution: int, options: FittedLora
@@ -249,6 +258,7 @@ def compare_completions(
     counter.remove()
     return found
 
+
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -275,6 +285,7 @@ def main(argv: list[str] | None = None) -> None:
     for way in compare_completions(pipe, pair, points, resolution, FittedLora()):
         numbers = f"{way.seconds:>9.2f}{way.passes:>8}{way.mae_m:>9.3f}{way.abs_rel:>9.3f}"
         print(f"{way.name:<34}{numbers}", flush=True)
+
 
 if __name__ == "__main__":
     main()

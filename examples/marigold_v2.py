@@ -34,6 +34,7 @@ TINY_TRANSFORMER = {
 }
 TINY_VAE = {"base_dim": 4, "dim_mult": [1, 2, 4, 4], "num_res_blocks": 1}
 
+
 def tiny_marigold_v2(seed: int = 0, space: str = "log") -> MarigoldV2Pipeline:
     """A tiny Marigold V2 with random weights, float32, at 64 px.
 
@@ -57,6 +58,7 @@ def tiny_marigold_v2(seed: int = 0, space: str = "log") -> MarigoldV2Pipeline:
     )
     pipe.set_progress_bar_config(disable=True)
     return pipe
+
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
@@ -91,6 +93,7 @@ def main(argv: list[str] | None = None) -> None:
         print(f"warning: {sentence}")
     np.save(options.out, depth_m)
     print(options.out)
+
 
 if __name__ == "__main__":
     main()

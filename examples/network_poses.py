@@ -1,16 +1,17 @@
 """Poses of Depth Anything 3, VGGT or MapAnything as a capture: transforms.json, then depth in metres.
 
-These networks return a pose and intrinsics for every image, for the size at which they processed it and without
-a metric scale. This script writes a transforms.json beside the images, which `geodiff capture` reads; with
---known-length or --distance its results are in metres. Files of predictions are .npz:
+These networks return a pose and intrinsics for every image, for the size at which they processed it and
+without a metric scale. This script writes a transforms.json beside the images, which `geodiff capture`
+reads; with --known-length or --distance its results are in metres. Files of predictions are .npz:
 
     da3           extrinsics (N, 3, 4) world-to-camera, intrinsics (N, 3, 3)
     vggt          extrinsic (N, 3, 4) world-to-camera, intrinsic (N, 3, 3), of pose_encoding_to_extri_intri
     mapanything   camera_poses (N, 4, 4) camera-to-world, intrinsics (N, 3, 3)
 
-each with the size of the network's images as `size` (width, height), or with `depth` or `images` of that size.
-All three use OpenCV's axes. VGGT scales an image to a fixed width and crops the height around the middle, or
-pads it to a square (--padded). Runs offline; without arguments, on small made-up predictions of all three:
+each with the size of the network's images as `size` (width, height), or with `depth` or `images` of that
+size. All three use OpenCV's axes. VGGT scales an image to a fixed width and crops the height around the
+middle, or pads it to a square (--padded). Runs offline; without arguments, on small made-up predictions of
+all three:
 
     python -m examples.network_poses vggt predictions.npz images/
     geodiff capture images/ --out depth --known-length NAME:X1,Y1,X2,Y2,METRES
@@ -37,12 +38,14 @@ NETWORKS = {
     "mapanything": ("camera_poses", "intrinsics", False),
 }
 
+
 def camera_to_world(poses: np.ndarray, world_to_camera: bool) -> np.ndarray:
     """``(N, 4, 4)`` of ``(N, 3, 4)`` or ``(N, 4, 4)``; a leading axis of one batch is dropped."""
     poses = np.asarray(poses, float).reshape(-1, *np.shape(poses)[-2:])
     E = np.tile(np.eye(4), (len(poses), 1, 1))
     E[:, : poses.shape[1]] = poses
     return np.linalg.inv(E) if world_to_camera else E
+
 
 def network_size(data: dict[str, np.ndarray]) -> tuple[int, int]:
     """``(width, height)`` of the network's images."""
@@ -57,6 +60,7 @@ def network_size(data: dict[str, np.ndarray]) -> tuple[int, int]:
         return sides[1], sides[0]
     raise SystemExit("The file needs the size of the network's images: size, depth or images.")
 
+
 def to_image(K: np.ndarray, of: tuple[int, int], size: tuple[int, int], padded: bool) -> np.ndarray:
     """Intrinsics of a network's image for the photograph that it was scaled, and cropped or padded, from."""
     factors = np.array(size) / np.array(of)
@@ -64,6 +68,7 @@ def to_image(K: np.ndarray, of: tuple[int, int], size: tuple[int, int], padded: 
         factors = np.full(2, max(size) / max(of) if padded else size[0] / of[0])
     centre = np.array(size) / 2 + factors * (K[:2, 2] + 0.5 - np.array(of) / 2) - 0.5
     return np.array([[factors[0] * K[0, 0], 0, centre[0]], [0, factors[1] * K[1, 1], centre[1]], [0, 0, 1]])
+
 
 def write_transforms(network: str, predictions: Path, images: Path, padded: bool = False) -> Path:
     """Write ``images/transforms.json`` for images that were given to the network in order of their names."""
@@ -91,6 +96,7 @@ def write_transforms(network: str, predictions: Path, images: Path, padded: bool
     path.write_text(json.dumps({"frames": frames}, indent=1))
     return path
 
+
 def stub(
     network: str, folder: Path, size: tuple[int, int] = (640, 480), of: tuple[int, int] = (518, 392)
 ) -> Path:
@@ -106,6 +112,7 @@ def stub(
     data = {poses: given, intrinsics: np.tile(K, (3, 1, 1)), "size": np.array(of)}
     np.savez(folder / f"{network}.npz", **data)
     return folder / f"{network}.npz"
+
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
@@ -131,6 +138,7 @@ def main(argv: list[str] | None = None) -> None:
                 f"{network}: {len(capture)} frames, unit {capture.unit}, 2 at {frame.E[:3, 3].round(3)}, "
                 f"focal length {frame.K[0, 0]:.1f} px"
             )
+
 
 if __name__ == "__main__":
     main()

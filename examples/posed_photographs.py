@@ -17,6 +17,7 @@ import torch
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
 from tests.scenes import render_pair
 
+
 def world_poses(E: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Camera-to-world poses of both cameras, in a world that is neither of them."""
     angle = np.radians(30.0)
@@ -28,6 +29,7 @@ def world_poses(E: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     ]
     T_world_from_left[:3, 3] = 1.0, -2.0, 0.5
     return T_world_from_left, T_world_from_left @ E
+
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
@@ -58,6 +60,7 @@ def main(argv: list[str] | None = None) -> None:
     error = np.abs(depth_m - truth_m)[known] / truth_m[known]
     print(f"truth {np.median(truth_m[known]):.2f} m, guided {np.median(depth_m):.2f} m (medians)")
     print(f"mean relative error {error.mean():.3f}; {out.visible.mean():.0%} seen by both cameras")
+
 
 if __name__ == "__main__":
     main()

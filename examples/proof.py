@@ -43,6 +43,7 @@ PUBLISHED = {
 }
 BLOCK_BYTES = 1 << 24
 
+
 @dataclass(frozen=True)
 class Pair:
     """Two posed views with the truth of the left one.
@@ -64,6 +65,7 @@ class Pair:
     E: np.ndarray
     depth_m: np.ndarray
     valid: np.ndarray
+
 
 @dataclass
 class Proof:
@@ -87,6 +89,7 @@ class Proof:
     seconds: list[tuple[float, float]] = field(default_factory=list)
     peak_bytes: int = 0
 
+
 def pairs_of(data: Path | None, most: int | None) -> Iterator[Pair]:
     """The bundled pair, then the first ``most`` of a folder of data sets."""
     demo = read_demo_pair()
@@ -97,6 +100,7 @@ def pairs_of(data: Path | None, most: int | None) -> Iterator[Pair]:
         cameras = sample.K_left, sample.K_right
         yield Pair(sample.label, sample.left, sample.right, cameras, sample.E, sample.depth_m, sample.valid)
 
+
 def weights_hash(layout: Layout) -> str:
     """16 hexadecimal digits of all safetensors of a folder, by name."""
     digest = hashlib.sha256()
@@ -106,6 +110,7 @@ def weights_hash(layout: Layout) -> str:
             while block := opened.read(BLOCK_BYTES):
                 digest.update(block)
     return digest.hexdigest()[:16]
+
 
 def prove(name: str, pairs: list[Pair], device: torch.device, dtype: torch.dtype, seed: int = 0) -> Proof:
     """Run one prior over all pairs, plain and guided.
@@ -142,6 +147,7 @@ def prove(name: str, pairs: list[Pair], device: torch.device, dtype: torch.dtype
         proof.guided.append(evaluate_depth(guided, *truth)["abs_rel"])
     return proof
 
+
 def page(proofs: list[Proof], pairs: list[Pair], device: torch.device, dtype: torch.dtype) -> str:
     """The report in Markdown."""
     machine = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
@@ -177,6 +183,7 @@ def page(proofs: list[Proof], pairs: list[Pair], device: torch.device, dtype: to
         lines += ["", "## Not on this machine", "", *(f"- {proof.name}: {proof.absent}" for proof in absent)]
     return "\n".join(lines) + "\n"
 
+
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -196,6 +203,7 @@ def main(argv: list[str] | None = None) -> None:
         print(f"{name}: {proofs[-1].absent or f'guided AbsRel {np.mean(proofs[-1].guided):.4f}'}")
         options.out.write_text(page(proofs, pairs, device, dtype), encoding="utf-8")
     print(options.out)
+
 
 if __name__ == "__main__":
     main()
