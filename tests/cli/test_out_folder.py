@@ -108,21 +108,6 @@ def test_a_report_of_something_else_deletes_nothing(tmp_path, report):
     assert names(tmp_path) == ["b", "out"] and names(out) == ["1", "cloud.ply", *WRITTEN]
 
 
-def test_the_unfinished_files_lie_inside_a_folder_that_exists(tmp_path):
-    """So that a mounted folder, or a link to another disk, is no border between them."""
-    disk, link = tmp_path / "disk", tmp_path / "link"
-    disk.mkdir()
-    link.symlink_to(disk)
-
-    def watched(folder):
-        assert folder.parent.parent == disk.resolve()
-        return fill(folder)
-
-    with OutFolder(link) as held:
-        held.write(watched)
-    assert names(disk) == WRITTEN and link.is_symlink()
-
-
 @pytest.mark.parametrize("fault", [errno.EACCES, errno.EROFS, errno.ENOSPC, "little room"])
 def test_a_folder_that_takes_no_file_is_refused_before_the_work(tmp_path, monkeypatch, fault):
     """By the first byte: whether a folder is read-only or a disk full shows no sooner to everybody."""

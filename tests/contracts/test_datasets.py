@@ -234,16 +234,6 @@ def test_a_file_that_is_missing_or_damaged_is_named(tmp_path, name, which, damag
             load(ref)
 
 
-@pytest.mark.parametrize("name", ["kitti2015", "middlebury2014", "eth3d"])
-def test_calibration_for_another_size_is_named(tmp_path, name):
-    write(tmp_path, LAYOUTS[name])
-    path = tmp_path / list(LAYOUTS[name])[CALIBRATION]
-    text = path.read_text().replace(f"width={WIDTH}", "width=99").replace(f": {WIDTH} {HEIGHT}", ": 99 40")
-    path.write_text(text)
-    with pytest.raises(ValueError, match=path.name):
-        sample_of(tmp_path, name)
-
-
 def test_sets_below_one_root_are_told_apart_and_ordered(tmp_path):
     for name in ("mvsnet", "eth3d", "kitti2012", "middlebury2014", "kitti2015"):
         write(tmp_path / name, LAYOUTS[name])

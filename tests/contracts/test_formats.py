@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 
 import numpy as np
@@ -208,14 +207,6 @@ def test_a_wrong_entry_is_named(tmp_path, sample, old, new, said):
 def test_a_wrong_choice_is_named(tmp_path, sample, given_, said):
     with pytest.raises(InputError, match=said):
         of.read_texts(tmp_path, *SAMPLES[sample], **(choice(sample) | given_))
-
-
-def test_ambiguous_names_ask_for_the_folder(tmp_path):
-    data = json.loads(SAMPLES["nerf"][0])
-    for frame, name in zip(data["frames"], ("one/a.png", "b.png", "two/a.png"), strict=True):
-        frame["file_path"] = name
-    with pytest.raises(InputError, match="may be one/a.png and two/a.png. Add its"):
-        of.read_texts(tmp_path, json.dumps(data), image_names=("a.png", "b.png"))
 
 
 @pytest.mark.parametrize(

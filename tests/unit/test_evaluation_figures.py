@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from geodiff_plugin.cli.eval import eval_app
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from geodiff_plugin.evaluation.figures import orbit, render_cloud, sweep_g_s
+from geodiff_plugin.evaluation.figures import sweep_g_s
 from geodiff_plugin.evaluation.options import FIGURES
 from geodiff_plugin.formats import write_depth_npy
 
@@ -88,19 +88,6 @@ def test_qualitative_has_clouds_reasons_and_perturbed_poses(draw, pair_folder, t
     assert numbers["abs_rel"] == {"folder/plane-turn3-shift0.1": {f"files:{maps}": None, "sgbm": None}}
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["pie"], "the figure must be one of"),
-        (["inner-steps", "--updates", "1,a"], "--updates must be whole numbers"),
-        (["gs-sweep", "--max", "1"], "--max must be between"),
-    ],
-)
-def test_bad_options_are_named(draw, words, said):
-    with pytest.raises(ValueError, match=said):
-        draw(*words)
-
-
 def test_the_sweep_of_a_true_map_is_best_at_the_true_scale(textured_plane, pair_folder):
     sample = load(find_pairs(pair_folder)[0])
     sweep, rendered = sweep_g_s(sample, textured_plane.depth_m / 2.5, "depth", 10.0)
@@ -110,16 +97,3 @@ def test_the_sweep_of_a_true_map_is_best_at_the_true_scale(textured_plane, pair_
     assert 1 / step**2 < g_s[loss.argmin()] / 2.5 < step**2
     assert sweep["visible"][-1] > sweep["visible"][0] and len(rendered) == 4
     assert {loss.argmin(), abs_rel.argmin(), len(g_s) - 1} <= set(rendered)
-
-
-def test_the_nearest_point_of_a_pixel_is_seen_from_the_left_and_above():
-    K = np.array([[10.0, 0, 1.0], [0, 10.0, 1.0], [0, 0, 1]])
-    depth_m = np.array([[3.0, 1.0, np.nan], [3.0, 0.0, np.inf], [3.0, 3.0, 3.0]])
-    image = np.zeros((3, 3, 3), np.uint8)
-    image[0, 1] = (9, 9, 9)
-    on_the_axis = np.diag([0.0, 0.0, 1.0, 1.0])  # every point moves there: the nearest wins
-    assert sorted(render_cloud(depth_m, image, K, on_the_axis).reshape(-1, 3).min(1)) == [9, 255, 255, 255]
-    T = orbit(3.0)
-    np.testing.assert_allclose(T @ [0, 0, 3, 1], [0, 0, 3, 1], atol=1e-12)
-    camera = np.linalg.inv(T)[:3, 3]
-    assert camera[0] < 0 and camera[1] < 0

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 
 import cv2
 import numpy as np
@@ -12,13 +11,10 @@ from PIL import Image
 
 from geodiff_plugin.algorithm.terms import Objective
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings, find_method
-from geodiff_plugin.evaluation.baselines.guided import _run_ramp
 from geodiff_plugin.evaluation.baselines.unguided import map_name, sgbm_shift
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample, make_sample
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_mm, write_pfm
-from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.matching.rows import fill_background
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.types import Rig
 from tests.contracts.tiny_transformers import MODELS, make_transformers
@@ -109,19 +105,6 @@ def test_fingerprint_tells_priors_and_decoders_apart(make_pipeline, tmp_path):
 def test_no_gradient_goes_through_a_network_that_does_not_see_z_t(name, textured_plane):
     with pytest.raises(NotApplicable, match="does not see"):
         find_method(name).run(plane_sample(textured_plane), Settings(), OnePipe(make_transformers("glpn")))
-
-
-@pytest.mark.parametrize(("steps", "updates"), [(None, 4), (2, 2)])
-def test_no_diffusion_makes_the_updates_of_the_default_without_the_network(
-    make_pipeline, textured_plane, monkeypatch, steps, updates
-):
-    pipe, counted, stock = make_pipeline(), [], Objective.__call__
-    monkeypatch.setattr(Objective, "__call__", lambda s, *args: counted.append(s) or stock(s, *args))
-    monkeypatch.setattr(pipe.unet, "forward", None)
-    preset = partial(GeometryGuidance, inner_steps=3, correct=False)
-    prediction = _run_ramp(preset, plane_sample(textured_plane), Settings(steps=steps), OnePipe(pipe))
-    assert prediction.depth_m.shape == textured_plane.depth_m.shape and (prediction.depth_m > 0).all()
-    assert len(counted) == updates * 3
 
 
 def test_reprojection_only_starts_from_the_map_of_the_prior_and_moves_its_pixels(
@@ -258,11 +241,3 @@ def test_sgbm_recovers_a_known_shift(doffs):
     shift = sgbm_shift(sample)
     assert np.isfinite(shift).mean() > 0.8 and np.nanmedian(shift) == pytest.approx(6 + doffs, abs=1 / 16)
     assert np.median(np.abs(run("sgbm", sample).depth_m / truth - 1)) < 0.02
-
-
-def test_background_fill_takes_the_farther_neighbour():
-    holes = np.full((4, 5), NAN)
-    holes[1, [1, 3]], holes[3, [0, 3, 4]] = (5.0, 2.0), (3.0, 9.0, 9.0)
-    expected = [[5, 5, 2, 2, 2], [5, 5, 2, 2, 2], [5, 5, 2, 2, 2], [3, 3, 3, 9, 9]]
-    np.testing.assert_array_equal(fill_background(holes), expected)
-    assert np.isnan(fill_background(np.full((2, 3), NAN))).all()

@@ -238,16 +238,6 @@ def test_boundary_errors_are_distances_of_parallel_edges(moved):
     assert errors == pytest.approx({"dbe_acc": moved, "dbe_comp": moved}, abs=0.2)
 
 
-def test_boundary_errors_without_boundaries():
-    truth = np.where(np.arange(60)[None] < 30, 2.0, 7.0).repeat(40, 0)
-    valid, flat = np.ones(truth.shape, bool), np.full(truth.shape, 3.0)
-    assert boundary_errors(flat, truth, valid) == {"dbe_acc": 10.0, "dbe_comp": 10.0}
-    far = np.where(np.arange(60)[None] < 50, 2.0, 7.0).repeat(40, 0)
-    assert boundary_errors(far, truth, valid)["dbe_acc"] == 10.0
-    assert np.isnan(boundary_errors(truth, flat, valid)["dbe_comp"])
-    assert np.isnan(boundary_errors(np.full(truth.shape, np.nan), truth, valid)["dbe_acc"])
-
-
 def test_errors_at_edges_and_of_surfaces():
     truth = np.full((40, 60), 2.0)
     truth[:, 30:] = 4.0

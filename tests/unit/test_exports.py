@@ -82,9 +82,3 @@ def test_colmap_comes_back_through_the_reader(tmp_path):
     assert lines[0].split()[3:] == ["2.00000", "128", "128", "128", "0"]
     with pytest.raises(ValueError, match="without blanks"):
         write_colmap(tmp_path, [("my left.png", *LEFT)], EMPTY)
-
-
-def test_thinned_keeps_first_and_last():
-    cloud = Cloud(np.arange(30.0).reshape(10, 3), np.zeros((10, 3), np.uint8))
-    assert cloud.thinned(4).points_m[:, 0].tolist() == [0, 9, 18, 27]
-    assert cloud.thinned(10) is cloud

@@ -223,15 +223,6 @@ def test_zed_rational_lenses_in_a_section_of_their_own(reading):
     assert reading(text, **ZED_HD).distortion[0].coefficients.tolist() == [1, 2, 3, 4, 5, 6, 0, 0]
 
 
-def test_realsense_prints_many_resolutions(reading):
-    text = SAMPLES["realsense_printed"][0]
-    other = text.replace("640", "1280").replace("480", "720").replace("700", "1100")
-    assert reading(other + text, image_size=(1280, 720)).K_right[1, 1] == 1100
-    assert reading(other + text, image_size=(640, 480)).K_right[1, 1] == 700
-    with pytest.raises(ValueError, match="640x480, 1280x720"):
-        reading(other + text)
-
-
 def test_realsense_models(reading):
     data = json.loads(SAMPLES["realsense"][0])
 
@@ -384,11 +375,3 @@ def test_every_pair_of_a_folder_has_its_own_cameras(tmp_path, kind):
     first = read("right.jpg")
     assert np.abs(read("other.jpg").E - first.E).max() > 0.01
     assert read("right.jpg").E.tolist() == first.E.tolist()
-
-
-def test_images_may_have_other_names_than_their_paths(tmp_path):
-    (tmp_path / "transforms.json").write_text(SAMPLES["nerf"][0])
-    paths, calib = (Path("page/0f/left.jpg"), Path("page/3a/right.jpg")), (tmp_path / "transforms.json",)
-    options = DepthOptions(left=paths[0], right=paths[1], calib=calib, baseline=0.12)
-    rig = read_rig(options, (640, 480), (640, 480), names=("left.jpg", "right.jpg"))
-    assert float(rig.E[0, 3]) == pytest.approx(0.12)

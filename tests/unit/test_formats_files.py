@@ -144,10 +144,3 @@ def test_flying_points_find_a_ramp_between_two_surfaces(angle):
     across = np.cos(np.deg2rad(angle)) * (u - 30) + np.sin(np.deg2rad(angle)) * (v - 30)
     flying = flying_points(np.interp(across, [-1.5, 1.5], [1.0, 4.0]))
     assert flying[np.abs(across) < 1.4].mean() > 0.95 and not flying[np.abs(across) > 3].any()
-
-
-def test_flying_points_ignore_what_is_unknown():
-    depth = np.full((10, 10), 2.0)
-    depth[4, 4], depth[0, 0], depth[7, 7] = 5.0, np.nan, 0.0
-    flying = flying_points(depth)
-    assert flying[4, 4] and flying.sum() == 1

@@ -178,13 +178,6 @@ def test_all_kinds_of_images_in_memory_agree(value, atol):
     assert not isinstance(value, torch.Tensor) or value.any(), "memory is not shared"
 
 
-def test_one_channel_is_repeated():
-    grey = RAMP[..., 0]
-    for value in (grey, grey[..., None], torch.from_numpy(grey)[None], Image.fromarray(grey)):
-        image = as_image_01(value, "right")
-        assert image.shape == (3, H, W) and torch.equal(image[0], image[2])
-
-
 def with_value(value):
     image = np.full((H, W, 3), 0.5, dtype=np.float32)
     image[3, 4, 1] = value

@@ -5,7 +5,6 @@ from __future__ import annotations
 import matplotlib
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from geodiff_plugin.plotting import colour_depth, depth_figure, depth_range, grid, ticks
@@ -47,11 +46,6 @@ def test_flat_and_empty_maps_and_ends_beyond_the_data_have_a_range(depth, ends):
     near, far = depth_range(depth, **ends)
     assert 0 < near < far and colour_depth(depth, **ends).shape == (*depth.shape, 3)
     assert depth_figure(depth, **ends).height >= 256
-
-
-def test_tensors_with_axes_of_length_1_are_maps():
-    depth = torch.linspace(1, 2, 12).reshape(1, 1, 3, 4)
-    np.testing.assert_array_equal(colour_depth(depth), colour_depth(depth[0, 0].numpy()))
 
 
 @pytest.mark.parametrize(

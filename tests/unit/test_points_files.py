@@ -45,15 +45,6 @@ def test_text_as_people_have_it(tmp_path, kind):
     np.testing.assert_allclose(read_points(tmp_path / "points.csv"), POINTS)
 
 
-@pytest.mark.parametrize("columns", [3, 4, 6])
-def test_columns_beyond_the_third_do_not_count(tmp_path, columns):
-    wide = np.concatenate([POINTS, np.full((2, columns - 3), 7.0)], axis=1)
-    np.save(tmp_path / "points.npy", wide)
-    np.testing.assert_allclose(read_points(tmp_path / "points.npy"), POINTS)
-    guidance = GeometryGuidance.from_points(wide, np.diag([60.0, 60.0, 1.0]) + 0.0)
-    np.testing.assert_allclose(guidance.inputs[0].points.numpy(), POINTS)
-
-
 PLY = "ply\nformat {kind} 1.0\ncomment by hand\nelement vertex 2\n{properties}{more}end_header\n"
 PROPERTIES = "property double x\nproperty uchar red\nproperty float y\nproperty float z\n"
 

@@ -95,15 +95,6 @@ def test_changed_inputs_and_lost_files_are_made_again(tmp_path):
     assert len(calls) == 3
 
 
-def test_a_fingerprint_is_of_contents(tmp_path):
-    here, there = tmp_path / "here", tmp_path / "there"
-    here.write_text("same")
-    there.write_text("same")
-    assert fingerprint({"file": here, "n": (1, 2)}) == fingerprint({"n": [1, 2], "file": there})
-    there.write_text("other")
-    assert fingerprint(here) != fingerprint(there)
-
-
 def test_a_failure_ends_the_run_unless_it_is_survived(tmp_path, capsys):
     fixed = False
 
