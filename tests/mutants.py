@@ -276,7 +276,7 @@ MUTANTS = [
         ),
     ),
     *of(
-        "formats/exif.py",
+        "formats/lenses.py",
         ("(per_unit_y or per_unit_x)", "per_unit_x"),
         ("{2: 25.4, 3: 10.0,", "{2: 25.4, 3: 25.4,"),
         ("math.hypot(36.0, 24.0)", "36.0"),

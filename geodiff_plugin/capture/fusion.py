@@ -11,8 +11,8 @@ from PIL import Image
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.capture.agreement import DepthFrame
 from geodiff_plugin.formats.clouds import Cloud, flying_points
-from geodiff_plugin.formats.colmap import write_colmap
 from geodiff_plugin.formats.out import atomic_path
+from geodiff_plugin.formats.sfm import write_colmap
 from geodiff_plugin.pose.capture import Observations
 
 #: Points closer than this share of the median depth are one; points of lower confidence are left out.

@@ -20,7 +20,7 @@ from geodiff_plugin.formats import (
     write_glb,
     write_ply,
 )
-from geodiff_plugin.formats.colmap import check_colmap_names
+from geodiff_plugin.formats.sfm import check_colmap_names
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.plotting import depth_figure, overview, share_figure
 from geodiff_plugin.types import MetricDepthOutput

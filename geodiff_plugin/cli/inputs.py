@@ -22,13 +22,15 @@ from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
 from geodiff_plugin.formats.depth import depth_of_disparity, read_map
-from geodiff_plugin.formats.distortion import (
+from geodiff_plugin.formats.lenses import (
     distortion_from_text,
+    intrinsics_from_exif,
+    intrinsics_from_fov,
     undistorted,
     undistorted_pixels,
     undistorted_points,
+    warn_of_other_lens,
 )
-from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov, warn_of_other_lens
 from geodiff_plugin.formats.points import read_confidence
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
 from geodiff_plugin.guidance.evidence import cleaned

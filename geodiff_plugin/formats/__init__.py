@@ -25,7 +25,7 @@ _MODULE_OF = {
     "read_points": "points",
     "read_text": "files",
     "rig_from_parameters": "rigs",
-    "write_colmap": "colmap",
+    "write_colmap": "sfm",
     "write_depth_mm": "depth",
     "write_depth_npy": "depth",
     "write_glb": "clouds",

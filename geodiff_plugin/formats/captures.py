@@ -12,12 +12,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from geodiff_plugin._checks import InputError, MissingFileError, bad_value
-from geodiff_plugin.formats.colmap import model_files, read_colmap_model, read_colmap_points
-from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.formats.files import open_image, read_matrix, read_rows, read_text
-from geodiff_plugin.formats.nerf import nerf_camera, nerf_frames, nerf_pose
+from geodiff_plugin.formats.lenses import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.formats.recordings import count_frames, is_video
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, lens_of, reading_whole, resized, rigid
+from geodiff_plugin.formats.sfm import (
+    model_files,
+    nerf_camera,
+    nerf_frames,
+    nerf_pose,
+    read_colmap_model,
+    read_colmap_points,
+)
 from geodiff_plugin.types import Distortion
 
 IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")

@@ -12,9 +12,9 @@ import numpy as np
 
 from geodiff_plugin._camera_checks import check_intrinsics, check_metres
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.formats.benchmarks import KITTI_ROW
 from geodiff_plugin.formats.depth import read_depth_png, read_pfm
 from geodiff_plugin.formats.files import check_file, open_image, read_npy, read_rows, read_text
+from geodiff_plugin.formats.stereo import KITTI_ROW
 
 PathLike = str | os.PathLike[str]
 KINDS = (

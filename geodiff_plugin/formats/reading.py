@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin._checks import bad_type, bad_value, check_number, warn
-from geodiff_plugin.formats import benchmarks, colmap, devices, nerf, robots
-from geodiff_plugin.formats.files import check_file, read_text
+from geodiff_plugin.formats import robots, sfm, stereo
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
 from geodiff_plugin.types import Rig
 
@@ -21,41 +20,41 @@ _JSON = r"\A\s*[{\[]"
 #: Every format by name. The first that recognises a file reads it: formats that others contain come first.
 CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "middlebury": CalibrationFormat(
-        "Middlebury or ETH3D calib.txt (cam0=[...])", r"^\s*cam0\s*=\s*\[", benchmarks.read_middlebury
+        "Middlebury or ETH3D calib.txt (cam0=[...])", r"^\s*cam0\s*=\s*\[", stereo.read_middlebury
     ),
     "kitti_cam_to_cam": CalibrationFormat(
-        "KITTI (P_rect_02: ...)", r"^\s*P_rect_\d+\s*:", benchmarks.read_kitti, uses_cameras=True
+        "KITTI (P_rect_02: ...)", r"^\s*P_rect_\d+\s*:", stereo.read_kitti, uses_cameras=True
     ),
     # The number behind the colon keeps OpenCV's "P1: !!opencv-matrix" out.
     "kitti_projections": CalibrationFormat(
-        "KITTI (P0: ...)", r"^\s*P[0-3]\s*:\s*[-+.\d]", benchmarks.read_kitti, uses_cameras=True
+        "KITTI (P0: ...)", r"^\s*P[0-3]\s*:\s*[-+.\d]", stereo.read_kitti, uses_cameras=True
     ),
     "foundation_stereo": CalibrationFormat(
         "K.txt of FoundationStereo (9 numbers, baseline)",
         r"\A(?i:[-+.\de\s,]|nan|inf)+\Z",
-        benchmarks.read_foundation_stereo,
+        stereo.read_foundation_stereo,
     ),
     "booster": CalibrationFormat(
         "Booster xml (proj_matL)", r"<opencv_st[\s\S]*proj_matL", robots.read_booster
     ),
     "mvsnet": CalibrationFormat(
-        "pair of MVSNet cam.txt (extrinsic)", r"^\s*extrinsic\s*$", benchmarks.read_mvsnet, (2,)
+        "pair of MVSNet cam.txt (extrinsic)", r"^\s*extrinsic\s*$", stereo.read_mvsnet, (2,)
     ),
     "zed": CalibrationFormat(
-        "ZED SN*.conf ([LEFT_CAM_HD])", r"^\s*\[(LEFT|RIGHT)_CAM_\w+\]", devices.read_zed
+        "ZED SN*.conf ([LEFT_CAM_HD])", r"^\s*\[(LEFT|RIGHT)_CAM_\w+\]", stereo.read_zed
     ),
     "realsense": CalibrationFormat(
         "RealSense (rs-enumerate-devices -c, or rs2 as JSON)",
-        rf'{devices.RS_PRINTED}|{_JSON}(?=[\s\S]*"ppx")',
-        devices.read_realsense,
+        rf'{stereo.RS_PRINTED}|{_JSON}(?=[\s\S]*"ppx")',
+        stereo.read_realsense,
     ),
     "oak": CalibrationFormat(
-        "OAK-D JSON (cameraData)", _JSON + r'(?=[\s\S]*"cameraData")', devices.read_oak, uses_cameras=True
+        "OAK-D JSON (cameraData)", _JSON + r'(?=[\s\S]*"cameraData")', stereo.read_oak, uses_cameras=True
     ),
     "nerf": CalibrationFormat(
         "transforms.json of nerfstudio or instant-ngp (frames, transform_matrix)",
         _JSON + r'(?=[\s\S]*"frames")(?=[\s\S]*"transform_matrix")',
-        nerf.read_nerf,
+        sfm.read_nerf,
         by_image=True,
     ),
     "kalibr": CalibrationFormat(
@@ -81,10 +80,10 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         (2,),
     ),
     "stereodemo": CalibrationFormat(
-        "stereodemo JSON (fx)", _JSON + r'(?=[\s\S]*"fx")', benchmarks.read_stereodemo
+        "stereodemo JSON (fx)", _JSON + r'(?=[\s\S]*"fx")', stereo.read_stereodemo
     ),
     "colmap": CalibrationFormat(
-        "COLMAP model (cameras.txt and images.txt)", colmap.MARK, colmap.read_colmap, (2,), by_image=True
+        "COLMAP model (cameras.txt and images.txt)", sfm.MARK, sfm.read_colmap, (2,), by_image=True
     ),
 }
 
@@ -99,20 +98,16 @@ def _texts(path: PathLike | Sequence[PathLike]) -> dict[Path, str]:
     if len(paths) not in (1, 2):
         bad_value("calibration", "one file, or a pair (left, right)", f"{len(paths)} files")
     if len(paths) == 1 and os.path.isdir(paths[0]):
-        paths = colmap.model_files(Path(paths[0])) or paths
-    what = "a calibration file"
-    texts = {}
-    for file in paths:
-        text = colmap.model_text(check_file(file, "calibration", what))
-        texts[Path(file)] = read_text(file, "calibration", what) if text is None else text
-    return texts
+        paths = sfm.model_files(Path(paths[0])) or paths
+    return {Path(file): sfm.calibration_text(file) for file in paths}
 
 
 def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
     """The format that all files have, as many as it needs."""
-    names, marks = [], CALIBRATION_FORMATS.items()
+    names = []
     for path, text in texts.items():
-        name = next((name for name, each in marks if re.search(each.mark, text, re.MULTILINE)), None)
+        fits = (name for name, each in CALIBRATION_FORMATS.items() if re.search(each.mark, text, re.M))
+        name = next(fits, None)
         if name is None:
             formats = "; ".join(entry.summary for entry in CALIBRATION_FORMATS.values())
             cure = "Is this the right file? Otherwise give fx, fy, cx, cy and baseline, or K and E."
@@ -129,17 +124,6 @@ def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
     return entry
 
 
-def _checked(cameras: tuple[int, int] | None, entry: CalibrationFormat) -> tuple[int, int] | None:
-    if cameras is None:
-        return None
-    if not entry.uses_cameras:
-        bad_value("cameras", "left out for a file of two cameras", cameras, "It chooses among more than two.")
-    pair = isinstance(cameras, (tuple, list)) and len(cameras) == 2
-    if not pair or not all(type(camera) is int for camera in cameras):
-        bad_value("cameras", "a pair of camera numbers, as (2, 3)", repr(cameras))
-    return cameras[0], cameras[1]
-
-
 def _in_metres(rig: Rig, baseline_m: float | None, by_image: bool) -> Rig:
     """The rig with its cameras ``baseline_m`` apart; a warning where nothing says what its unit is."""
     if baseline_m is None:
@@ -154,9 +138,8 @@ def _in_metres(rig: Rig, baseline_m: float | None, by_image: bool) -> Rig:
     check_number(baseline_m, "baseline_m", float(np.finfo(np.float64).tiny), 1e9)
     length = float(np.linalg.norm(rig.E[:3, 3]))
     if length == 0:
-        bad_value(
-            "baseline_m", f"left out for {rig.source}", baseline_m, "Both its cameras are at one place."
-        )
+        cure = "Both its cameras are at one place."
+        bad_value("baseline_m", f"left out for {rig.source}", baseline_m, cure)
     E = rig.E.copy()
     E[:3, 3] *= baseline_m / length
     return replace(rig, E=E)
@@ -199,12 +182,9 @@ def read_calibration(
     """
     texts = _texts(path)
     entry, source = _format_of(texts), " and ".join(map(str, texts))
-    choice = CameraChoice(
-        _checked(cameras, entry),
-        None if image_folder_hint is None else str(image_folder_hint),
-        None if image_names is None else (str(image_names[0]), str(image_names[1])),
-        None if image_size is None else (int(image_size[0]), int(image_size[1])),
-    )
+    if cameras is not None and not entry.uses_cameras:
+        bad_value("cameras", "left out for a file of two cameras", cameras, "It chooses among more than two.")
+    choice = CameraChoice(cameras, image_folder_hint, image_names, image_size)
     with reading_whole(source, entry.summary):
         rig = replace(entry.read(tuple(texts.values()), choice), source=source)
     for side, lens in zip(("left", "right"), rig.distortion, strict=True):

@@ -25,7 +25,14 @@ Entry = TypeVar("Entry")
 DISTORTION_TOLERANCE = 1e-6
 #: Images of one sensor differ in their ratio of sides by rounding only; beyond this one of them was cropped.
 RATIO_TOLERANCE = 0.01
-#: How many coefficients OpenCV's functions take, by the model's name in ``Distortion``.
+#: What files call the lenses that OpenCV has, in small letters -> the model's name in ``Distortion``.
+LENS_MODELS = {
+    **{"": "opencv", "cameratype 0": "opencv", "cameratype 1": "fisheye"},
+    **dict.fromkeys("opencv pinhole simple_pinhole none brownconrady".split(), "opencv"),
+    **dict.fromkeys("radtan radial-tangential plumb_bob rational_polynomial".split(), "opencv"),
+    **dict.fromkeys("fisheye opencv_fisheye equidistant kannalabrandt4 kannalabrandt8".split(), "fisheye"),
+}
+#: How many coefficients OpenCV's functions take.
 COEFFICIENT_COUNTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
 #: What a reader that takes a whole file for granted raises on one that is not.
 UNFINISHED = (
@@ -53,7 +60,7 @@ class Camera:
         K: ``(3, 3)`` pixels, the centre of the first pixel at (0, 0).
         size: ``(width, height)`` that ``K`` is for; ``None``, or a pair of ``None``, if unknown.
         coefficients: of the lens, in OpenCV's order; empty for none.
-        model: ``"opencv"``, ``"fisheye"``, or the file's name of a model that OpenCV does not have.
+        model: the file's name of the lens model (``LENS_MODELS``).
     """
 
     K: np.ndarray
@@ -160,9 +167,11 @@ def of_size(by_size: Mapping[Size, Entry], choice: CameraChoice) -> Entry:
     return by_size[choice.image_size]
 
 
-def two_cameras(choice: CameraChoice, available: Collection[int]) -> tuple[int, int]:
-    """``choice.cameras``, which must be given, as two different ones of those that a file has."""
-    left, right = choice.cameras or (0, 0)
+def two_cameras(
+    choice: CameraChoice, available: Collection[int], default: tuple[int, int]
+) -> tuple[int, int]:
+    """``choice.cameras``, else the default, as two different ones of those that a file has."""
+    left, right = choice.cameras or default
     if left == right or not {left, right} <= set(available):
         have = ", ".join(map(str, sorted(available))) or "none"
         bad_value("cameras", f"two different cameras of the file ({have})", f"{left},{right}")
@@ -176,9 +185,8 @@ def names_of_pair(names: Collection[str], choice: CameraChoice) -> tuple[str, st
     ends with it; of several the one with the most folders in common is taken.
     """
     if choice.image_names is None:
-        expected = "given for a calibration of many images, as ('left.jpg', 'right.jpg')"
-        bad_value("image_names", expected, "none")
-    left, right = (_named(names, wanted) for wanted in choice.image_names)
+        bad_value("image_names", "given, as ('left.jpg', 'right.jpg'), for a file of many images", "none")
+    left, right = (_named(names, str(wanted)) for wanted in choice.image_names)
     if left == right:
         bad_value("the images", "two of those in the file", f"{left} for both", "Check their names.")
     return left, right
@@ -220,16 +228,20 @@ def is_distorted(lens: Distortion | None) -> bool:
 
 def lens_of(camera: Camera, name: str) -> Distortion | None:
     """The lens of a camera, which messages name; ``None`` where it moves no pixel."""
-    counts = COEFFICIENT_COUNTS.get(camera.model)
-    if counts is None:
+    model = LENS_MODELS.get(camera.model.lower(), "")
+    if not model:
         cure = "OpenCV does not have this model: undistort or rectify both images to a pinhole first."
-        bad_value(f"the lens model of {name}", f"one of {', '.join(COEFFICIENT_COUNTS)}", camera.model, cure)
-    lens = Distortion(camera.model, array_of(camera.coefficients, (-1,), f"the lens distortion of {name}"))
+        bad_value(f"the lens model of {name}", "opencv or fisheye", camera.model, cure)
+    numbers = array_of(camera.coefficients, (-1,), f"the lens distortion of {name}")
+    if model == "fisheye" and not numbers[4:].any():  # lists may be filled up with zeros
+        numbers = numbers[:4]
+    lens = Distortion(model, numbers)
     if not is_distorted(lens):
         return None
-    if lens.coefficients.size not in counts:
-        expected = f"{', '.join(map(str, counts))} coefficients in OpenCV's order ({camera.model})"
-        bad_value(f"the lens distortion of {name}", expected, lens.coefficients.tolist(), CHECK_FILE)
+    counts = COEFFICIENT_COUNTS[model]
+    if numbers.size not in counts:
+        expected = f"{', '.join(map(str, counts))} coefficients in OpenCV's order ({model})"
+        bad_value(f"the lens distortion of {name}", expected, numbers.tolist(), CHECK_FILE)
     return lens
 
 
@@ -263,8 +275,7 @@ def make_rig(left: Camera, right: Camera, pose: Any, *, rectified: bool = False)
     sizes = [_pixels(camera.size, name) for name, camera in cameras]
     lens_left, lens_right = (lens_of(camera, name) for name, camera in cameras)
     rectified = rectified and lens_left is lens_right is None
-    lenses = (lens_left, lens_right)
-    return Rig(Ks[0], Ks[1], E, sizes[0], sizes[1], distortion=lenses, rectified=rectified)
+    return Rig(Ks[0], Ks[1], E, *sizes, distortion=(lens_left, lens_right), rectified=rectified)
 
 
 def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any = None) -> Rig:
@@ -301,8 +312,9 @@ def rig_from_parameters(
     Raises:
         TypeError, ValueError: not finite numbers, or not above 0 where they must be.
     """
-    cx_right = cx if cx_right is None else cx_right
     for name, value, unit in (("fx", fx, "pixels"), ("fy", fy, "pixels"), ("baseline", baseline_m, "metres")):
         check_positive(value, name, unit)
-    left, right = (Camera(intrinsics(fx, fy, x, cy), size) for x in (cx, cx_right))
+    left, right = (
+        Camera(intrinsics(fx, fy, x, cy), size) for x in (cx, cx if cx_right is None else cx_right)
+    )
     return make_rig(left, right, baseline_m)

@@ -29,17 +29,9 @@ from geodiff_plugin.types import Rig
 MM_PER_METRE = 1000.0
 #: OpenCV's head of a YAML file, which YAML itself does not know; files written by hand copy it.
 OPENCV_HEAD = re.compile(r"\A\s*%YAML:[^\n]*")
-#: OpenCV's name of a distortion model.
-LENSES = {
-    **dict.fromkeys(("radtan", "radial-tangential", "plumb_bob", "rational_polynomial"), "opencv"),
-    **{"none": "opencv", "": "opencv", "equidistant": "fisheye", "fisheye": "fisheye"},
-}
 CALIBRATE_PAIR = "Calibrate the pair (camera_calibration with two topics)."
-#: Which coefficients a lens has, and what OpenCV calls it, by ORB-SLAM's ``Camera.type``.
-ORB_LENSES = {
-    "PinHole": ("opencv", ("k1", "k2", "p1", "p2", "k3")),
-    "KannalaBrandt8": ("fisheye", ("k1", "k2", "k3", "k4")),
-}
+#: Which coefficients a lens has, by ORB-SLAM's ``Camera.type``.
+ORB_LENSES = {"PinHole": ("k1", "k2", "p1", "p2", "k3"), "KannalaBrandt8": ("k1", "k2", "k3", "k4")}
 #: The right camera's pose in the left one's frame, in settings of version 1.0 and in older ones.
 ORB_POSES = ("Stereo.T_c1_c2", "Tlr")
 #: The baseline of rectified images and their types, by the left camera's name: settings of version 1.0 say
@@ -108,16 +100,14 @@ def _pinhole(entries: Entries, coefficients: str) -> Camera:
     if entries["camera_model"] != "pinhole":
         cure = "Calibrate with pinhole-radtan or pinhole-equi, or undistort the images to a pinhole first."
         bad_value("camera_model", "pinhole", repr(entries["camera_model"]), cure)
-    model = str(entries["distortion_model"])
     K = intrinsics(*entries["intrinsics"])
-    return Camera(K, entries["resolution"], entries[coefficients], LENSES.get(model, model))
+    return Camera(K, entries["resolution"], entries[coefficients], str(entries["distortion_model"]))
 
 
 def read_kalibr(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """Two cameras of a chain, cam0 and cam1 unless chosen; ``T_cn_cnm1`` takes points to a camera."""
     chain = _yaml(texts[0])
-    have = [n for n in range(len(chain)) if f"cam{n}" in chain]
-    pair = (0, 1) if choice.cameras is None else two_cameras(choice, have)
+    pair = two_cameras(choice, [n for n in range(len(chain)) if f"cam{n}" in chain], (0, 1))
     from_first = [np.eye(4)]
     for n in range(1, max(pair) + 1):
         step = rigid(chain[f"cam{n}"]["T_cn_cnm1"], f"T_cn_cnm1 of cam{n}")
@@ -166,18 +156,18 @@ def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     for info, size in zip(infos, sizes, strict=True):
         turns.append(transform(info["R"], (0, 0, 0), "R"))
         model = str(info["distortion_model"])
-        cameras.append(Camera(array_of(info["K"], (3, 3), "K"), size, info["D"], LENSES.get(model, model)))
+        cameras.append(Camera(array_of(info["K"], (3, 3), "K"), size, info["D"], model))
     return make_rig(cameras[0], cameras[1], np.linalg.inv(turns[0]) @ raw.E @ turns[1])
 
 
 def _orb_camera(entries: Entries, name: str, kind: str) -> Camera:
     """The camera of a name; a pinhole may leave its coefficients out, or the last one."""
-    model, lens = ORB_LENSES[kind]
+    lens = ORB_LENSES[kind]
     there = [key for key in lens if f"{name}.{key}".lower() in entries]
-    keys = ("fx", "fy", "cx", "cy", *(() if model == "opencv" and not there else lens[: max(4, len(there))]))
+    keys = ("fx", "fy", "cx", "cy", *(() if kind == "PinHole" and not there else lens[: max(4, len(there))]))
     numbers = [float(array_of(entries.get(f"{name}.{key}".lower()), (), f"{name}.{key}")) for key in keys]
     size = [entries.get(f"camera.{side}", [None])[0] for side in ("width", "height")]
-    return Camera(intrinsics(*numbers[:4]), size, numbers[4:], model)
+    return Camera(intrinsics(*numbers[:4]), size, numbers[4:], kind)
 
 
 def read_orb_slam(texts: tuple[str, ...], choice: CameraChoice) -> Rig:

@@ -15,7 +15,7 @@ from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit
 from geodiff_plugin._checks import bad_type, bad_value, check_number
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.formats import as_image_01
-from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
+from geodiff_plugin.formats.lenses import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.geometry import image_size, resize_intrinsics, unproject
 from geodiff_plugin.guidance.evidence import cleaned, coarse_depth
 from geodiff_plugin.guidance.inputs import as_points

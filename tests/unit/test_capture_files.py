@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from geodiff_plugin import InputError
 from geodiff_plugin.formats.captures import read_capture
 from geodiff_plugin.formats.clouds import Cloud
-from geodiff_plugin.formats.colmap import write_colmap
+from geodiff_plugin.formats.sfm import write_colmap
 from tests.unit.capture_room import SIZE, K, render, walk, write_transforms
 
 TRUE = walk(4)

@@ -7,7 +7,7 @@ import pytest
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.formats import read_calibration
-from geodiff_plugin.formats.colmap import model_files, read_colmap_model, read_colmap_points
+from geodiff_plugin.formats.sfm import model_files, read_colmap_model, read_colmap_points
 from tests.contracts.calibrations import SAMPLES, choice
 
 CAMERAS, IMAGES = SAMPLES["colmap"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geodiff_plugin.formats.distortion import (
+from geodiff_plugin.formats.lenses import (
     distortion_from_text,
     undistorted,
     undistorted_pixels,

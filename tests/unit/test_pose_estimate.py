@@ -12,7 +12,7 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from geodiff_plugin.formats.exif import intrinsics_from_exif, intrinsics_from_fov
+from geodiff_plugin.formats.lenses import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.geometry import unproject
 from geodiff_plugin.guidance.photographs import estimate_rig
 from geodiff_plugin.pose.estimate import estimate_pose

@@ -1,18 +1,18 @@
-"""Factory calibrations of stereo cameras: ZED, RealSense, OAK-D."""
+"""Calibrations of data sets (S5.1) and stereo cameras: KITTI, Middlebury, MVSNet, ZED, RealSense, OAK-D."""
 
 from __future__ import annotations
 
 import configparser
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, warn
 from geodiff_plugin.formats.rigs import (
     Camera,
     CameraChoice,
@@ -20,11 +20,27 @@ from geodiff_plugin.formats.rigs import (
     intrinsics,
     make_rig,
     of_size,
+    projected,
     resized,
+    rigid,
     transform,
+    two_cameras,
 )
 from geodiff_plugin.types import Rig
 
+MM_PER_METRE = 1000.0
+ENTRY = re.compile(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*?)[ \t]*$", re.MULTILINE)
+#: Files are printed with three decimals, so an honest cam1 agrees with doffs better than this.
+DOFFS_TOLERANCE_PX = 0.05
+KITTI_ROW = re.compile(r"^\s*(\w+)\s*:(.*)$", re.MULTILINE)
+PROJECTION = re.compile(r"(P_rect_|P)(\d+)")
+#: KITTI's grey pair and colour pair.
+PAIRS = ((0, 1), (2, 3))
+#: Folder names of the benchmarks: image_2 and image_02, and colored_0 of KITTI 2012.
+FOLDER = re.compile(r"(image|colored)_0?([0-3])(?!\d)")
+WHICH = (
+    "Of the grey pair 0,1 and the colour pair 2,3 of the calibration 2,3 is taken. Give cameras (--cameras)."
+)
 #: Width and height of the images that a ZED's section is for.
 ZED_SIZES = {
     **{"4K": (3840, 2160), "QHDPLUS": (3200, 1800), "2K": (2208, 1242), "FHD1200": (1920, 1200)},
@@ -32,7 +48,6 @@ ZED_SIZES = {
 }
 #: In OpenCV's order, which is that of its models with 5 and with 8 coefficients.
 ZED_LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-MM_PER_METRE = 1000.0
 
 RS_PRINTED = r'^\s*Intrinsic of "'
 RS_INTRINSIC = re.compile(
@@ -42,16 +57,97 @@ RS_EXTRINSIC = re.compile(
     r'^\s*Extrinsic from "Infrared 1"\s+To\s+"Infrared 2"[^\n]*\n(.*?)(?=\n\s*Extrinsic|\Z)', re.M | re.S
 )
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
-#: ``rs2_distortion`` by the end of its name and by its number; others are none of OpenCV's.
-RS_LENSES = {"brownconrady": "opencv", "4": "opencv", "kannalabrandt4": "fisheye", "5": "fisheye"}
-
 #: CAM_B and CAM_C, where every OAK-D has its left and its right camera.
 OAK_PAIR = (1, 2)
 METRES_PER_CENTIMETRE = 0.01
-#: dai::CameraModel by its number; the others are none of OpenCV's.
-OAK_LENSES = {0: "opencv", 1: "fisheye"}
 
 Sockets = dict[int, dict[str, Any]]
+
+
+def _matrix(entries: dict[str, str], key: str) -> np.ndarray:
+    value = entries[key]
+    if not value.endswith("]"):
+        bad_value(key, "[f 0 cx; 0 f cy; 0 0 1]", repr(value), "Is the file cut off?")
+    return array_of([row.split() for row in value.strip("[]").split(";")], (3, 3), key)
+
+
+def read_middlebury(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """``doffs`` is what the ground truth was made with, so ``cx0 + doffs`` goes before ``cam1``.
+
+    Convention:
+        ``doffs = cx1 - cx0``, so that Z = baseline * f / (disparity + doffs); the baseline is in millimetres.
+    """
+    entries = dict(ENTRY.findall(texts[0]))
+    K_left = _matrix(entries, "cam0")
+    K_right = _matrix(entries, "cam1") if "cam1" in entries else None
+    if K_right is None or "doffs" in entries:
+        expected = K_left[0, 2] + float(entries["doffs"])
+        if K_right is None or abs(K_right[0, 2] - expected) > DOFFS_TOLERANCE_PX:
+            said = "is missing" if K_right is None else f"says cx = {K_right[0, 2]:g}"
+            warn(f"cam1 {said}; using cx0 + doffs = {expected:g} px for the right image.")
+            K_right = K_left.copy() if K_right is None else K_right
+            K_right[0, 2] = expected
+    size = entries.get("width"), entries.get("height")
+    baseline_m = float(entries["baseline"]) / MM_PER_METRE
+    return make_rig(Camera(K_left, size), Camera(K_right, size), baseline_m, rectified=True)
+
+
+def read_foundation_stereo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """``K.txt``: nine numbers of K of both images, and the baseline in metres."""
+    values = texts[0].replace(",", " ").split()
+    if len(values) != 10:
+        cure = "Add the baseline as a second line; a file that holds only K or E goes to K and E (--K, --E)."
+        bad_value("the file", "9 numbers of K and the baseline in metres", f"{len(values)} numbers", cure)
+    camera = Camera(array_of(values[:9], (3, 3), "K"))
+    return make_rig(camera, camera, values[9])
+
+
+def read_stereodemo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """Older files have one principal point for both images."""
+    data = json.loads(texts[0])
+    size = data.get("width"), data.get("height")
+    left, right = (
+        Camera(intrinsics(data["fx"], data["fy"], data["cx" if "cx" in data else cx], data["cy"]), size)
+        for cx in ("cx0", "cx1")
+    )
+    return make_rig(left, right, data["baseline_meters"])
+
+
+def _kitti_cameras(available: Collection[int], choice: CameraChoice) -> tuple[int, int]:
+    """The pair that was given, else of the image folder's name, else the colour pair, else the only one."""
+    have = sorted(available)
+    pairs = [pair for pair in PAIRS if set(pair) <= set(have)] or [(have[0], have[-1])]
+    for kind, camera in FOLDER.findall(str(choice.image_folder_hint))[-1:]:
+        pair = PAIRS[kind == "colored" or int(camera) >= 2]
+        if pair in pairs:
+            return two_cameras(choice, have, pair)
+    if len(pairs) > 1 and choice.cameras is None:
+        warn(WHICH)
+    return two_cameras(choice, have, pairs[-1])
+
+
+def read_kitti(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """``P_rect_02`` with ``S_rect_02`` of ``calib_cam_to_cam``, or ``P0`` to ``P3``; DrivingStereo's too."""
+    rows = dict(KITTI_ROW.findall(texts[0]))
+    named = {int(match[2]): match for match in map(PROJECTION.fullmatch, rows) if match}
+    cameras = [named[camera] for camera in _kitti_cameras(named, choice)]
+    P = [array_of(rows[camera[0]].split(), (3, 4), camera[0]) for camera in cameras]
+    sizes = [rows.get(f"S_rect_{camera[2]}") for camera in cameras]
+    return projected(*P, *(None if size is None else size.split() for size in sizes))
+
+
+def _mvsnet_view(text: str) -> tuple[np.ndarray, Camera]:
+    """World-to-camera transform and camera; the line of depth range behind them is never looked at."""
+    extrinsic, _, intrinsic = text.partition("extrinsic")[2].partition("intrinsic")
+    # The rotations of hand-held sets are rigid to a few 1e-4 only; inverting them as they are would shear E.
+    T = rigid(extrinsic.split()[:16], "extrinsic")
+    return T, Camera(array_of(intrinsic.split()[:9], (3, 3), "intrinsic"))
+
+
+def read_mvsnet(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """One ``cam.txt`` a view, in the unit of the files: metres in most sets, millimetres in DTU."""
+    (T_left_from_world, left), (T_right_from_world, right) = map(_mvsnet_view, texts)
+    return make_rig(left, right, T_left_from_world @ np.linalg.inv(T_right_from_world))
 
 
 def read_zed(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
@@ -87,12 +183,10 @@ def _rs_camera(values: dict[str, Any]) -> Camera:
     """A camera of rs2's entries; a lens of coefficients 0 is none, whatever its model."""
     K = intrinsics(*(values[key] for key in ("fx", "fy", "ppx", "ppy")))
     coefficients = array_of(values.get("coeffs", ()), (-1,), "coeffs")
-    said = str(values.get("model", "none"))
-    model = RS_LENSES.get(re.sub(r"^.*distortion|[^a-z0-9]", "", said.lower()), said)
-    if model == "fisheye":
-        coefficients = coefficients[:4]
-    elif not coefficients.any():
-        model = "opencv"
+    model = re.sub(r"^.*distortion|[^a-z0-9]", "", str(values.get("model", "none")).lower())
+    model = {"4": "brownconrady", "5": "kannalabrandt4"}.get(model, model)  # the numbers of rs2_distortion
+    if model != "kannalabrandt4" and not coefficients.any():
+        model = "none"
     return Camera(K, (values["width"], values["height"]), coefficients, model)
 
 
@@ -152,18 +246,12 @@ def read_realsense(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 
 def _oak_camera(cameras: Sockets, socket: int, choice: CameraChoice, with_lens: bool) -> Camera:
     """The camera, at another resolution of the whole sensor where one is asked for."""
-    if socket not in cameras:
-        bad_value("cameras", f"sockets of the file ({', '.join(map(str, sorted(cameras)))})", socket)
     entries = cameras[socket]
     K = array_of(entries["intrinsicMatrix"], (3, 3), f"intrinsicMatrix of socket {socket}")
     camera = Camera(K, (entries["width"], entries["height"]))
     if with_lens:
-        numbers = array_of(entries["distortionCoeff"], (-1,), "distortionCoeff")
-        kind = entries.get("cameraType", 0)
-        model = OAK_LENSES.get(kind, f"cameraType {kind}")
-        # A fisheye has four, in a list that may be filled up with zeros.
-        numbers = numbers if model == "opencv" or numbers[4:].any() else numbers[:4]
-        camera = replace(camera, coefficients=numbers, model=model)
+        model = f"cameraType {entries.get('cameraType', 0)}"
+        camera = replace(camera, coefficients=entries["distortionCoeff"], model=model)
     cure = "It is a crop of the sensor: give --fx --fy --cx --cy --baseline of the cropped image."
     return resized(camera, choice.image_size or camera.size, "the left image", cure)
 
@@ -193,7 +281,7 @@ def read_oak(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     stereo = data.get("stereoRectificationData") or {}
     pair = stereo.get("leftCameraSocket", OAK_PAIR[0]), stereo.get("rightCameraSocket", OAK_PAIR[1])
     pair = pair if min(pair) >= 0 else OAK_PAIR
-    left, right = choice.cameras or pair
+    left, right = two_cameras(choice, cameras, pair)
     rectified = (left, right) == pair and bool(stereo.get("rectifiedRotationLeft"))
     first, second = (_oak_camera(cameras, socket, choice, not rectified) for socket in (left, right))
     from_left, from_right = _oak_links(cameras, left), _oak_links(cameras, right)

@@ -1,7 +1,9 @@
-"""COLMAP's models, text and binary: cameras, poses and points; a pair of images as a rig; writing (S5.1)."""
+"""Structure from motion: COLMAP's models, which are written too, and ``transforms.json`` (S5.1)."""
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import re
 import struct
@@ -15,9 +17,19 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.clouds import Cloud
-from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.files import check_file, read_text
 from geodiff_plugin.formats.out import atomic_path
-from geodiff_plugin.formats.rigs import Camera, CameraChoice, array_of, intrinsics, make_rig, names_of_pair
+from geodiff_plugin.formats.rigs import (
+    LENS_MODELS,
+    Camera,
+    CameraChoice,
+    array_of,
+    intrinsics,
+    make_rig,
+    names_of_pair,
+    rigid,
+)
+from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.types import Rig
 
 #: Of a model, in the order of its numbers in binary files: how many focal lengths stand before cx cy, what
@@ -58,27 +70,28 @@ def model_files(folder: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def model_text(path: Path) -> str | None:
-    """The text of a model's cameras or images without its points, which may be hundreds of megabytes.
+def calibration_text(path: str | os.PathLike[str]) -> str:
+    """The text of a calibration file, of a COLMAP model without its points.
 
-    ``None`` for a text file without the head of ``images.txt``; binary files are read as the text that they
-    stand for. A file that did not change is not read again: every pair of a run asks for it.
+    Binary models are read as the text that they stand for. A file that did not change is not read again:
+    every pair of a run asks for it.
     """
-    state = path.stat()
-    return _model_text(path.absolute(), state.st_size, state.st_mtime_ns)
+    file = check_file(path, "calibration", "a calibration file")
+    state = file.stat()
+    return _calibration_text(file.absolute(), state.st_size, state.st_mtime_ns)
 
 
 @lru_cache(maxsize=4)
-def _model_text(path: Path, size: int, changed_ns: int) -> str | None:
+def _calibration_text(path: Path, size: int, changed_ns: int) -> str:
     if path.name == "cameras.bin":
         return "\n".join([CAMERAS_MARK, *_binary_cameras(path)])
     if path.name == "images.bin":
         return "\n".join([IMAGES_MARK, *_binary_images(path)])
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         head = file.readline(LONGEST_HEAD)
-        if not head.startswith(IMAGES_MARK):
-            return None
-        return head + "".join(line for line in file if line.startswith("#") or IMAGE.match(line))
+        if head.startswith(IMAGES_MARK):
+            return head + "".join(line for line in file if line.startswith("#") or IMAGE.match(line))
+    return read_text(path, "calibration", "a calibration file")
 
 
 class _Bytes:
@@ -151,8 +164,7 @@ def _images(text: str) -> dict[str, Posed]:
 
 def read_colmap_model(files: tuple[Path, Path]) -> tuple[dict[int, Camera], dict[str, Posed]]:
     """The cameras of a model by number, and its images by name, of its files of both."""
-    texts = [model_text(path) or path.read_text("utf-8-sig", "replace") for path in files]
-    return _cameras(texts[0]), _images(texts[1])
+    return _cameras(calibration_text(files[0])), _images(calibration_text(files[1]))
 
 
 def read_colmap_points(folder: Path) -> dict[int, np.ndarray]:
@@ -198,6 +210,83 @@ def read_colmap(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     return make_rig(cameras[left], cameras[right], T_left @ np.linalg.inv(T_right))
 
 
+#: Of a transforms.json, by OpenCV's model: coefficients in its order, and those that it does not have.
+NERF_LENSES = {
+    "opencv": (("k1", "k2", "p1", "p2", "k3"), ("k4",)),
+    "fisheye": (("k1", "k2", "k3", "k4"), ("p1", "p2")),
+}
+#: The order of nerfstudio's ``distortion_params``.
+NERF_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
+Frame = dict[str, Any]
+
+
+def nerf_frames(text: str) -> dict[str, Frame]:
+    """Frames by ``file_path``, each with the entries of the whole file that it does not have itself."""
+    data = json.loads(text)
+    shared = {key: value for key, value in data.items() if key not in ("frames", "transform_matrix")}
+    return {str(frame["file_path"]): shared | frame for frame in data["frames"]}
+
+
+def _nerf_lens(frame: Frame) -> tuple[str, list[float]]:
+    model = str(frame.get("camera_model", "OPENCV_FISHEYE" if frame.get("is_fisheye") else "OPENCV"))
+    if model.lower() not in LENS_MODELS:
+        return model, []
+    params = frame.get("distortion_params", [frame.get(key, 0.0) for key in NERF_PARAMS])
+    numbers = dict(zip(NERF_PARAMS, array_of(params, (6,), ", ".join(NERF_PARAMS)).tolist(), strict=True))
+    coefficients, others = NERF_LENSES[LENS_MODELS[model.lower()]]
+    if any(numbers[key] for key in others):
+        cure = "OpenCV does not have this model: undistort or rectify both images first."
+        bad_value(" and ".join(others), f"zero for {model}", [numbers[key] for key in others], cure)
+    return model, [numbers[key] for key in coefficients]
+
+
+def _focal_px(frame: Frame, axis: str, side: float) -> float | None:
+    """The focal length of one axis, or ``None`` where the file leaves it to the other one."""
+    angle = frame.get(f"camera_angle_{axis}")
+    if f"fl_{axis}" in frame or angle is None:
+        return frame.get(f"fl_{axis}")
+    if not 0 < angle < math.pi:
+        bad_value(f"camera_angle_{axis}", "in radians, between 0 and pi", angle, "Is it in degrees?")
+    return 0.5 * side / math.tan(0.5 * angle)
+
+
+def nerf_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> Camera:
+    """The camera of a frame; ``image_size`` is that of its image, for files without ``w`` and ``h``."""
+    size = (frame["w"], frame["h"]) if "w" in frame else image_size
+    if size is None:
+        cure = "Give image_size, the (width, height) of the images."
+        bad_value("the file", "one with entries 'w' and 'h'", "none", cure)
+    focals = [_focal_px(frame, axis, float(side)) for axis, side in zip("xy", size, strict=True)]
+    given = [focal for focal in focals if focal is not None]
+    if not given:
+        bad_value("the file", "one with an entry 'fl_x' or 'camera_angle_x'", "none")
+    K = intrinsics(given[0], given[-1], frame.get("cx", size[0] / 2), frame.get("cy", size[1] / 2))
+    K[:2, 2] -= 0.5  # as COLMAP, both programs put the centre of the first pixel at (0.5, 0.5)
+    model, coefficients = _nerf_lens(frame)
+    return Camera(K, size, coefficients, model)
+
+
+def nerf_pose(frame: Frame) -> np.ndarray:
+    """``(4, 4)`` camera-to-world in OpenCV's axes, lengths as before nerfstudio's ``applied_scale``."""
+    pose = rigid(frame["transform_matrix"], "transform_matrix") @ OPENGL_FROM_OPENCV
+    pose[:3, 3] /= float(frame.get("applied_scale", 1.0))
+    return pose
+
+
+def read_nerf(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """The two images of ``choice.image_names``; a frame's entries go before the file's.
+
+    Lengths keep the unit of the poses; ``applied_transform`` turns the world and changes no relative pose.
+
+    Source: data conventions of nerfstudio's documentation, its ``colmap_utils.py`` (intrinsics are written as
+        COLMAP has them) and ``cameras.py`` (rays through pixel + 0.5); ``nerf_loader.cu`` of instant-ngp.
+    """
+    frames = nerf_frames(texts[0])
+    left, right = (frames[name] for name in names_of_pair(frames, choice))
+    E = np.linalg.inv(nerf_pose(left)) @ nerf_pose(right)
+    return make_rig(nerf_camera(left, choice.image_size), nerf_camera(right, choice.image_size), E)
+
+
 def check_colmap_names(names: Sequence[str]) -> None:
     """Refuse names of images that a model cannot hold: those with a blank."""
     for name in names:
@@ -232,16 +321,9 @@ def write_colmap(
     check_colmap_names([name for name, *_ in views])
     cloud = cloud.thinned(MOST_POINTS) if seen is None else cloud
     seen = [(np.zeros((0, 2)), np.zeros(0, int))] * len(views) if seen is None else seen
-    cameras = [f"{CAMERAS_MARK} one line of data each:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    images = [
-        f"{IMAGES_MARK} two lines of data each:",
-        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
-        "#   POINTS2D[] as (X, Y, POINT3D_ID)",
-    ]
-    points = [
-        "# 3D point list with one line of data each:",
-        "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
-    ]
+    cameras = [f"{CAMERAS_MARK} CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    images = [f"{IMAGES_MARK} IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then POINTS2D[]"]
+    points = ["# 3D point list with POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
     tracks = [""] * len(cloud.points_m)
     for number, ((name, K, E, (width, height)), (px, rows)) in enumerate(zip(views, seen, strict=True), 1):
         fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
