@@ -20,6 +20,7 @@ from geodiff_plugin.app.form import Form, build_form
 from geodiff_plugin.app.job import Priors, Stopped, run_job
 from geodiff_plugin.app.results import (
     NAMES,
+    SCENE,
     K_of,
     Pixels,
     depth_of,
@@ -40,7 +41,7 @@ FORGET_AFTER_S = 600
 #: The cloud: points of this confidence, looked at from so many degrees around it and down from above, and
 #: from a share of its depth.
 LEAST_CONFIDENCE, VIEW_ANGLES, VIEW_FROM = 0.5, (90, 75), 1.05
-CLOUD_TAB, PANEL_HEIGHT, NIGHT = "Point cloud", 560, (0.09, 0.1, 0.12, 1.0)
+CLOUD_TAB, FILES_TAB, PANEL_HEIGHT, NIGHT = "Point cloud", "Downloads", 560, (0.09, 0.1, 0.12, 1.0)
 THEME = gr.themes.Base(
     primary_hue="teal",
     neutral_hue="slate",
@@ -163,7 +164,7 @@ def _everything(panels: SimpleNamespace, job: Job) -> dict[Any, Any]:
 
 def _scene(job: Job) -> tuple[Any, str]:
     """The view of the cloud of confident points from behind the cameras, and a line about it."""
-    path, depth_m = job.folder.path / "scene.glb", depth_of(job)
+    path, depth_m = job.folder.path / SCENE, depth_of(job)
     count = write_scene(path, job, LEAST_CONFIDENCE)
     share, away = 100 * count / depth_m.size, VIEW_FROM * float(np.percentile(depth_m, 90))
     view = gr.Model3D(str(path), camera_position=(*VIEW_ANGLES, away))
@@ -252,17 +253,22 @@ def _wire_panels(panels: SimpleNamespace, state: gr.State, points: gr.State, tab
     def clear(job: Job | None) -> tuple[Any, ...]:
         return redraw(job, [])
 
-    def turn(job: Job | None, event: gr.SelectData) -> tuple[Any, Any, Any]:
-        # A 3D view that gets its file while it is hidden stays empty (gradio 6.31).
-        if job is None or event.value != CLOUD_TAB:
-            return event.value, gr.skip(), gr.skip()
-        return (event.value, *_scene(job))
+    def turn(job: Job | None, pixels: Pixels, event: gr.SelectData) -> dict[Any, Any]:
+        """What is made when its tab is opened."""
+        shown: dict[Any, Any] = {tab: event.value}
+        if job is not None and event.value == CLOUD_TAB:
+            # A 3D view that gets its file while it is hidden stays empty (gradio 6.31).
+            shown[panels.scene], shown[panels.points] = _scene(job)
+        elif job is not None and event.value == FILES_TAB:  # with what was measured
+            shown[panels.files] = [str(path) for path in files_of(job, pixels)]
+        return shown
 
     measured = [points, panels.picture, panels.readings]
     panels.picture.select(click, [state, points], measured, **QUICK)
     gr.on([panels.add.click, panels.pixel.submit], add, [state, points, panels.pixel], measured, **QUICK)
     panels.clear.click(clear, state, measured, **QUICK)
-    panels.tabs.select(turn, state, [tab, panels.scene, panels.points], **QUICK)
+    shows = [tab, panels.scene, panels.points, panels.files]
+    panels.tabs.select(turn, [state, points], shows, **QUICK)
 
 
 def _image(label: str, **more: Any) -> gr.Image:
@@ -311,7 +317,7 @@ def _build_panels() -> SimpleNamespace:
             panels.points = gr.HTML(elem_id="points")
         with gr.Tab("How sure"):
             panels.confidence, panels.confidence_legend = _image("Confidence"), gr.HTML()
-        with gr.Tab("Downloads"):
+        with gr.Tab(FILES_TAB):
             panels.files_verdict = gr.HTML()
             label = "All in one, depth, cloud and report"
             panels.files = gr.File(label=label, interactive=False, elem_id="files")

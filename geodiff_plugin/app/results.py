@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,6 +25,7 @@ LARGEST_SIDE = 1600
 MOST_POINTS_SHOWN = 250_000
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 LEGEND_STOPS = 24
+EVERYTHING, MEASUREMENTS, SCENE = "everything.zip", "measurements.csv", "scene.glb"
 MARK = "#c2410c"
 Pixels = list[tuple[int, int]]
 
@@ -156,6 +158,19 @@ def _words(readings: list[Reading]) -> str:
     return f'<div class="say">{segments}{table}{more}<p class="legend-caption">{note}</p></div>'
 
 
+def _write_readings(path: Path, readings: Sequence[Reading]) -> None:
+    """Points and segments as CSV: pixels of the photograph, metres."""
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(("name", "x_px", "y_px", "x_m", "y_m", "z_m", "spread_m", "confidence", "distance_m"))
+        for name, each in zip(NAMES, readings, strict=False):
+            point = (f"{value:.4f}" for value in each.point_m)
+            writer.writerow((name, *each.pixel, *point, each.spread_m, each.confidence, ""))
+        for a, b, first, second in zip(NAMES[::2], NAMES[1::2], readings[::2], readings[1::2], strict=False):
+            length, spread = distance_m(first, second)
+            writer.writerow((f"{a} to {b}", *[""] * 5, spread, "", f"{length:.4f}"))
+
+
 def write_scene(path: Path, job: Job, least_confidence: float) -> int:
     """Cloud and cameras as GLB, light enough for a browser; how many points there are in all."""
     depth_m, confidence = depth_of(job), map_of(job, "confidence")
@@ -167,17 +182,24 @@ def write_scene(path: Path, job: Job, least_confidence: float) -> int:
     return len(cloud.points_m)
 
 
-def files_of(job: Job) -> list[Path]:
-    """Everything that can be downloaded, most wanted first; ``everything.zip``, made here, has all."""
+def files_of(job: Job, pixels: Sequence[tuple[int, int]] = ()) -> list[Path]:
+    """Everything that can be downloaded, most wanted first, with ``measurements.csv`` of these pixels.
+
+    ``everything.zip``, made here, has all.
+    """
     folder = job.folder.path
+    if pixels:
+        _write_readings(folder / MEASUREMENTS, [reading(job, pixel) for pixel in pixels])
+    else:
+        (folder / MEASUREMENTS).unlink(missing_ok=True)
     report = (folder / REPORT).read_text(encoding="utf-8")
     for path in (*job.options.photographs().values(), *job.options.calib):
         report = report.replace(str(path), path.name)
     (folder / REPORT).write_text(report, encoding="utf-8")
     wanted = f"depth_mm.png depth.npy depth.png confidence.npy cloud.ply cloud.glb {REPORT}".split()
-    others = sorted(path.name for path in folder.iterdir() if path.name not in wanted)
+    others = sorted({path.name for path in folder.iterdir()} - {*wanted, EVERYTHING, SCENE})
     paths = [folder / name for name in (*wanted, *others) if (folder / name).is_file()]
-    with ZipFile(folder / "everything.zip", "w", ZIP_STORED) as archive:
+    with ZipFile(folder / EVERYTHING, "w", ZIP_STORED) as archive:
         for path in paths:
             archive.write(path, path.name)
-    return [folder / "everything.zip", *paths]
+    return [folder / EVERYTHING, *paths]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,11 +49,28 @@ JOURNAL = ".pairs.jsonl"
 MOST_ROWS = 20
 #: Options that a result does not depend on.
 NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "strict", "device", "encoding"}
+#: Behind an error, they say that the next pair cannot be written either.
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 Row = dict[str, Any]
 
 
 class _EndsRun(BaseException):
-    """The prior does not load, which no pair can be spared; its cause says why."""
+    """What no pair can be spared: the prior does not load, the disk is full; its cause says which."""
+
+
+@contextmanager
+def _ends_run_on_full_disk() -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None and getattr(cause, "errno", None) not in DISK_FULL:
+            cause = cause.__cause__ or cause.__context__
+        if isinstance(cause, OSError):
+            resumes = "Finished pairs stay; the same command goes on with the rest."
+            full = InputError(f"The disk of --out is full ({reason_of(cause)}). {resumes}")
+            raise _EndsRun from full
+        raise
 
 
 class Stages:
@@ -81,7 +99,8 @@ class Stages:
         check_pair(ref, options)
         check_files(options, photographs=ref.frame is None)
         held = self._folders[item.key] = ExitStack()
-        job = Job(options, held.enter_context(out_folder_of(options)))
+        with _ends_run_on_full_disk():
+            job = Job(options, held.enter_context(out_folder_of(options)))
         digests = _digests(options)  # before: what changes later is another version
         job.entries = {"pair": {"name": ref.name, "frame": ref.frame, "sha256": digests}}
         job.read(None if ref.frame is None else self._frames(ref, ref.frame))
@@ -124,7 +143,8 @@ class Stages:
 
     def write(self, job: Job) -> Row:
         """The files, the report last, and the row of the table."""
-        return _row(job.write(self._pipe))
+        with _ends_run_on_full_disk():
+            return _row(job.write(self._pipe))
 
     def release(self, item: Item) -> None:
         """Give back the folder of a pair."""
@@ -233,7 +253,7 @@ def _any_fails(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
         device = torch.device("cuda", process.local % torch.cuda.device_count())
     stages = Stages(options if process.index == 0 else replace(options, quiet=True), device)
     try:
-        with collected_warnings(warn_once()):
+        with collected_warnings(warn_once()), _ends_run_on_full_disk():
             records = runner.run(
                 stages.read, stages.evidence, stages.guide, stages.write, release=stages.release
             )

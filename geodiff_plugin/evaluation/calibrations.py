@@ -130,7 +130,9 @@ TRUST_NOTE = (
     "Median error of the depth as a share of the truth; left and right exchanged, there is no truth. A wrong "
     "focal length of a rectified pair scales the depth and changes nothing else: two views cannot show it."
 )
-RIGHT = "right"
+#: Known points of the kinds about points: so many of the truth.
+POINTS = 200
+Change = Callable[[StereoSample, StereoSample], StereoSample]
 
 
 def _moved(sample: StereoSample, centre: np.ndarray) -> StereoSample:
@@ -145,39 +147,84 @@ def _scaled(sample: StereoSample, factor: float) -> StereoSample:
     return replace(sample, K_left=sample.K_left @ scale, K_right=sample.K_right @ scale)
 
 
-def _tilted(sample: StereoSample) -> StereoSample:
+def _tilted(sample: StereoSample, _: StereoSample) -> StereoSample:
     """As if not rectified: the right camera nods by two degrees."""
     nod = np.eye(4)
     nod[:3, :3] = Rotation.from_euler("x", 2.0, degrees=True).as_matrix()
     return replace(sample, E=sample.E @ nod)
 
 
-WRONG: dict[str, tuple[str, Callable[[StereoSample], StereoSample]]] = {
-    "swapped": ("left and right images exchanged", lambda s: replace(s, left=s.right, right=s.left)),
-    "inverse": ("E is world-to-camera", lambda s: replace(s, E=np.linalg.inv(s.E))),
-    "axis": ("E along y where it is along x", lambda s: _moved(s, s.E[[1, 0, 2], 3])),
-    "tilted": ("not rectified: 2 degrees of pitch", _tilted),
-    "mirrored": ("right image mirrored", lambda s: replace(s, right=s.right[:, ::-1].copy())),
-    "millimetres": ("baseline in millimetres", lambda s: _moved(s, s.E[:3, 3] * 1000.0)),
-    "thousandth": ("baseline divided by 1000 once too often", lambda s: _moved(s, s.E[:3, 3] * 0.001)),
-    "K-1.5": ("K of an image 1.5 times as large, centred", lambda s: _scaled(s, 1.5)),
-    "K-2": ("K of an image twice as large, centred", lambda s: _scaled(s, 2.0)),
-    "K-0.67": ("K of an image 0.67 times as large, centred", lambda s: _scaled(s, 0.67)),
+def _shifted(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """The right picture is the left one, moved: every disparity is the same."""
+    shift = max(2, sample.left.shape[1] // 20)
+    return replace(sample, right=np.roll(sample.left, -shift, axis=1), K_right=sample.K_left)
+
+
+def _as_it_is(sample: StereoSample, _: StereoSample) -> StereoSample:
+    return sample
+
+
+KINDS: dict[str, tuple[str, Change, float | None]] = {
+    "right": ("right", _as_it_is, None),
+    "right, points": ("right, points", _as_it_is, 1.0),
+    "swapped": ("left and right images exchanged", lambda s, _: replace(s, left=s.right, right=s.left), None),
+    "inverse": ("E is world-to-camera", lambda s, _: replace(s, E=np.linalg.inv(s.E)), None),
+    "axis": ("E along y where it is along x", lambda s, _: _moved(s, s.E[[1, 0, 2], 3]), None),
+    "tilted": ("not rectified: 2 degrees of pitch", _tilted, None),
+    "mirrored": ("right image mirrored", lambda s, _: replace(s, right=s.right[:, ::-1].copy()), None),
+    "millimetres": ("baseline in millimetres", lambda s, _: _moved(s, s.E[:3, 3] * 1000.0), None),
+    "thousandth": (
+        "baseline divided by 1000 once too often",
+        lambda s, _: _moved(s, s.E[:3, 3] * 0.001),
+        None,
+    ),
+    "K-1.5": ("K of an image 1.5 times as large, centred", lambda s, _: _scaled(s, 1.5), None),
+    "K-2": ("K of an image twice as large, centred", lambda s, _: _scaled(s, 2.0), None),
+    "K-0.67": ("K of an image 0.67 times as large, centred", lambda s, _: _scaled(s, 0.67), None),
+    "unrelated": (
+        "right image of another scene",
+        lambda s, other: replace(s, right=other.right, K_right=other.K_right),
+        None,
+    ),
+    "one-picture": ("the left image twice", lambda s, _: replace(s, right=s.left, K_right=s.K_left), None),
+    "shifted": ("right image a shifted copy of the left one", _shifted, None),
+    "points-256": ("points in 1/256 m read as millimetres", _as_it_is, 0.256),
+    "points-mm": ("points in millimetres read as metres", _as_it_is, 1000.0),
+    "points-3": ("points 3 times too far", _as_it_is, 3.0),
 }
-"""Kind -> what it is, and how a right sample becomes so."""
+"""Kind -> what it is, how a sample becomes so beside another one, and what true points are multiplied by."""
+RIGHT = [kind for kind in KINDS if kind.startswith("right")]
+WRONG = [kind for kind in KINDS if kind not in RIGHT]
+
+
+def _points(sample: StereoSample) -> np.ndarray:
+    """``(POINTS, 3)`` of the truth, metres in the left camera's frame."""
+    rows, columns = np.nonzero(sample.valid)
+    some = np.random.default_rng(0).permutation(len(rows))[:POINTS]
+    z = sample.depth_m[rows[some], columns[some]].astype(np.float64)
+    rays = np.stack([columns[some], rows[some], np.ones(len(some))], axis=1) @ np.linalg.inv(sample.K_left).T
+    return rays * z[:, None]
 
 
 def _measure(
-    ref: SampleRef, kind: str, read: Callable[[SampleRef], StereoSample], pipe: Any, settings: Settings
+    ref: SampleRef,
+    other: SampleRef,
+    kind: str,
+    read: Callable[[SampleRef], StereoSample],
+    pipe: Any,
+    settings: Settings,
 ) -> Record:
     """One guided call, what was said of it, and how far it is off."""
     original = read(ref).check_truth()
-    sample = original if kind == RIGHT else WRONG[kind][1](original)
+    _, change, factor = KINDS[kind]
+    sample = change(original, read(other))
+    points = None if factor is None else factor * _points(original)
     head = {"rectified": original.rectified}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            guidance = GeometryGuidance(sample.right, (sample.K_left, sample.K_right), sample.E)
+            K = sample.K_left, sample.K_right
+            guidance = GeometryGuidance(sample.right, K, sample.E, points=points)
             out = pipe(Image.fromarray(sample.left), guidance=guidance, **call_arguments(settings))
         except InputError as error:
             return head | {"status": "refused", "said": [str(error)], "off": None}
@@ -204,7 +251,7 @@ def _median(own: Sequence[Record]) -> str:
 
 
 _COLUMNS: dict[str, CellOf] = {
-    "given as": lambda own: WRONG.get(own[0]["kind"], (RIGHT,))[0],
+    "given as": lambda own: KINDS[own[0]["kind"]][0],
     "median error": _median,
     "not trusted": partial(_share, told=False),
     "anything said": _share,
@@ -217,7 +264,7 @@ def _table(group: str, records: Sequence[Record]) -> Table:
     pairs = count_of_pairs(len({record["sample"] for record in records}), f"{group} ")
     title = f"Wrong calibrations detected, right ones not trusted: {pairs}"
     table = tables.table_of_groups(title, records, ("kind",), _COLUMNS, TRUST_NOTE)
-    wrong = [record for record in records if record["kind"] != RIGHT]
+    wrong = [record for record in records if record["kind"] in WRONG]
     # Rectified rows stay rows under any focal length.
     seen = [record for record in wrong if not (record["rectified"] and record["kind"].startswith("K-"))]
     sums = {"all wrong ones": wrong, "without focal lengths of rectified pairs": seen}
@@ -227,20 +274,27 @@ def _table(group: str, records: Sequence[Record]) -> Table:
 
 def run_trust(name: str, options: TrustOptions) -> Page | None:
     """Measure, write ``trust.jsonl`` and the table; errors as ``run_experiment``."""
-    kinds = options.kinds or tuple(WRONG)
-    for kind in kinds:
+    for kind in options.kinds:
         check_choice(kind, "--kinds", WRONG)
+    wrong = options.kinds or WRONG
+    right = RIGHT if any(KINDS[kind][2] for kind in wrong) else RIGHT[:1]
     pairs = real_and_rendered(options, f"synthetic:{{}}@{options.width}x{options.width * 3 // 4}")
-    settings, priors, read = options.settings, PriorCache(), lru_cache(maxsize=1)(load)
+    if "unrelated" in options.kinds and any(len(refs) == 1 for refs in pairs):
+        bad_value("--kinds", "without 'unrelated' where a pair is alone", "it", "Give two pairs or more.")
+    settings, priors, read = options.settings, PriorCache(), lru_cache(maxsize=2)(load)
     configuration = guided_configuration(GeometryGuidance, settings)
     pipe, prior = priors.get(settings), f"{settings.prior} {priors.fingerprint(settings)}"
     cells = []
     for group, refs in zip(("real", "rendered"), pairs, strict=True):
-        for ref in refs:
-            for kind in (RIGHT, *kinds):
+        for ref, following in zip(refs, (*refs[1:], *refs[:1]), strict=True):
+            for kind in (*right, *wrong):
+                unrelated = kind == "unrelated"
+                if unrelated and len(refs) == 1:
+                    continue
+                beside = {"other": experiment.cell_key(following, "", {})} if unrelated else {}
                 head = {"kind": kind, "group": group, "sample": ref.label}
-                work = partial(_measure, ref, kind, read, pipe, settings)
-                key = experiment.cell_key(ref, kind, configuration, prior)
+                work = partial(_measure, ref, following if unrelated else ref, kind, read, pipe, settings)
+                key = experiment.cell_key(ref, kind, configuration | beside, prior)
                 cells.append(Item(key, work, name=f"{ref.label}, {kind}", head=head))
 
     def page_tables(records: list[Record]) -> list[Table]:

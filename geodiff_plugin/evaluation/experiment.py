@@ -68,7 +68,7 @@ class Page:
 def write_page(
     command: str, options: Any, title: str, tables: Iterable[Table], remarks: Sequence[str]
 ) -> Page:
-    """Write the tables that have rows into ``--out``, in Markdown and JSON, and the page to ``--results``."""
+    """Write the tables that have rows into ``--out``: Markdown, which ``--results`` gets too, LaTeX, JSON."""
     shown = tuple(table for table in tables if table.rows)
     page = Page(title, run_facts(command, options), shown, tuple(remarks))
     head = [f"# {title}", f"    {page.facts['command']}", page.origin(), *remarks]
@@ -76,6 +76,7 @@ def write_page(
     path = options.out / f"{'table' if command == 'pairs' else command}.md"
     for target in filter(None, (path, options.results)):
         write_text(target, text)
+    write_text(path.with_suffix(".tex"), "\n".join(table.latex() for table in shown))
     plain = page.facts | {"remarks": list(remarks), "tables": list(map(asdict, shown))}
     write_text(path.with_suffix(".json"), json.dumps(plain, indent=1, ensure_ascii=False) + "\n")
     return page

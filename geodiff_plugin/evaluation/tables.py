@@ -1,4 +1,4 @@
-"""Tables in Markdown and JSON: means with intervals, and those of a comparison of methods."""
+"""Tables in Markdown, LaTeX and JSON: means with intervals, and those of a comparison of methods."""
 
 from __future__ import annotations
 
@@ -18,6 +18,13 @@ FEWEST_FOR_INTERVAL = 5
 #: Column headings of the depth metrics, by their names in a record.
 HEADINGS = {"abs_rel": "AbsRel", "delta1": "δ1", "delta2": "δ2", "delta3": "δ3"}
 HEADINGS |= {"rmse": "RMSE m", "log_rmse": "log RMSE", "silog": "SILog"}
+
+#: What LaTeX reads as a command, or lacks.
+_LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+_LATEX |= {character: f"\\{character}" for character in "_%&#${}"}
+_LATEX |= {"<": "$<$", ">": "$>$", "|": "$|$", "δ": r"$\delta$", "γ": r"$\gamma$", "ε": r"$\epsilon$"}
+_LATEX |= {"±": r"$\pm$", "↓": r"$\downarrow$", "↑": r"$\uparrow$", "†": r"$^\dagger$"}
+_LATEX |= {"✓": r"$\checkmark$", "✗": r"$\times$", "×": r"$\times$"}
 
 ValueOf = Callable[[Record], float | None]
 #: Records of one row -> what stands in a column.
@@ -95,6 +102,16 @@ class Table:
         rows = [f"| {' | '.join(row)} |" for row in cells]
         lines += [rows[0], "| --- |" + " ---: |" * (len(self.header) - 1), *rows[1:]]
         return "\n".join(lines) + "\n"
+
+    def latex(self) -> str:
+        """A ``tabular`` for booktabs, its title as a comment."""
+        escapes = str.maketrans(_LATEX)
+        cells = [[cell.translate(escapes) for cell in row] for row in (self.header, *self.rows)]
+        header, *rows = (" & ".join(row) + r" \\" for row in cells)
+        groups = [rf"\multicolumn{{{n}}}{{c}}{{{name.translate(escapes)}}}" for name, n in self.groups]
+        lines = [f"% {self.title}", rf"\begin{{tabular}}{{l{'r' * (len(self.header) - 1)}}}", r"\toprule"]
+        lines += [" & ".join(groups) + r" \\"] if groups else []
+        return "\n".join([*lines, header, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
 def grouped(records: Iterable[Record], *names: str) -> dict[Any, list[Record]]:

@@ -239,6 +239,24 @@ def test_a_table_that_cannot_be_written_in_the_end_is_shown(geodiff, finished, m
     assert answer.err.splitlines()[-1] == told
 
 
+def test_a_full_disk_ends_the_run_and_keeps_what_is_finished(geodiff, fresh, monkeypatch):
+    write = many.Job.write
+
+    def full(job, pipe):
+        if job.options.out.name == "b":
+            raise OSError(errno.EDQUOT, "Disk quota exceeded")
+        return write(job, pipe)
+
+    monkeypatch.setattr(many.Job, "write", full)
+    answer = geodiff(*COMMAND)
+    assert answer.code == 2 and answer.err.count("exceeded") == 1
+    assert "is full (Disk quota exceeded). Finished pairs stay; the same command goes on" in answer.err
+    assert Path("out/a/report.json").exists() and not Path("out/b").exists()
+    monkeypatch.setattr(many.Job, "write", write)
+    answer = geodiff(*COMMAND)
+    assert answer.code == 0 and "0 failed" in answer.out and "0 there" not in answer.out
+
+
 # Videos
 
 

@@ -27,6 +27,7 @@ from geodiff_plugin.app.results import (
     map_of,
     marked,
     measurement,
+    reading,
 )
 from geodiff_plugin.formats import read_calibration, read_image
 
@@ -159,6 +160,15 @@ def test_a_job_and_its_files(result):
     assert report["inputs"]["E"][0][3] == pytest.approx(0.12) and report["arguments"]["left"] == "left.png"
     assert report["arguments"]["ensemble"] == 2 and "cx is assumed" in " ".join(report["warnings"])
     assert report["verdict"]["status"] == result.output.verdict.status
+    pixels = [(5, 5), (50, 40), (20, 20)]
+    with ZipFile(files_of(result, pixels)[0]) as archive:  # which does not hold itself
+        assert sorted(archive.namelist()) == sorted([*names[1:], "measurements.csv"])
+        header, *rows = archive.read("measurements.csv").decode().splitlines()
+    assert header.startswith("name,x_px") and rows[0].startswith("A,5,5,")
+    assert [row.split(",")[0] for row in rows] == ["A", "B", "C", "A to B"]
+    length = distance_m(*(reading(result, pixel) for pixel in pixels[:2]))[0]
+    assert float(rows[3].split(",")[-1]) == pytest.approx(length, abs=1e-3)
+    assert [path.name for path in files_of(result)] == names, "nothing is measured"
 
 
 def test_points_are_marked_where_they_were_clicked_and_told_in_words(result):

@@ -10,7 +10,7 @@ from scipy.stats import spearmanr
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.evaluation import calibrations, strength
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, find_method
-from geodiff_plugin.evaluation.calibrations import WRONG
+from geodiff_plugin.evaluation.calibrations import KINDS, POINTS, RIGHT, WRONG
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.options import STRENGTHS, StrengthOptions, TrustOptions
 from geodiff_plugin.evaluation.strength import EmulatedPrior, relative_map, run_strength
@@ -89,18 +89,24 @@ def test_options_that_cannot_be_measured_or_shown(tmp_path, monkeypatch, wrong, 
 
 
 def test_every_kind_of_wrong_calibration_changes_what_it_says(sample):
-    cases = {kind: change(sample) for kind, (_, change) in WRONG.items()}
+    other = replace(sample, right=sample.right[::-1], K_right=2 * sample.K_right)
+    cases = {kind: change(sample, other) for kind, (_, change, _) in KINDS.items()}
     for kind, case in cases.items():
         names = ("left", "right", "K_left", "K_right", "E")
         changed = {name for name in names if not np.array_equal(getattr(case, name), getattr(sample, name))}
-        images = {"swapped": {"left", "right"}, "mirrored": {"right"}}
-        assert changed == images.get(kind, {"K_left", "K_right"} if kind.startswith("K-") else {"E"}), kind
+        expected = {"swapped": {"left", "right"}, "unrelated": {"right", "K_right"}}
+        expected |= dict.fromkeys(("mirrored", "one-picture", "shifted"), {"right"})
+        expected |= {kind: set() for kind, (_, _, factor) in KINDS.items() if factor or kind in RIGHT}
+        assert changed == expected.get(kind, {"K_left", "K_right"} if kind.startswith("K-") else {"E"}), kind
     assert cases["millimetres"].E[0, 3] == pytest.approx(1000 * sample.E[0, 3])
     assert cases["K-2"].K_left[0, 0] == pytest.approx(2 * sample.K_left[0, 0])
     assert cases["K-2"].K_left[0, 2] == sample.K_left[0, 2]
     np.testing.assert_allclose(cases["inverse"].E @ sample.E, np.eye(4), atol=1e-12)
     tilt = np.linalg.inv(sample.E[:3, :3]) @ cases["tilted"].E[:3, :3]
     assert np.degrees(np.arctan2(tilt[2, 1], tilt[1, 1])) == pytest.approx(2.0)
+    points = calibrations._points(sample)
+    column, row = np.rint(points[0] @ sample.K_left.T / points[0, 2]).astype(int)[:2]
+    assert len(points) == POINTS and points[0, 2] == pytest.approx(sample.depth_m[row, column], rel=1e-6)
 
 
 @pytest.fixture
@@ -116,11 +122,12 @@ def test_trust_counts_and_goes_on(tmp_path, monkeypatch, weights):
     """All but the rectified pair's K are detected; one right pair is not trusted."""
     asked = []
 
-    def measure(ref, kind, read, pipe, settings):
+    def measure(ref, other, kind, read, pipe, settings):
         asked.append(kind)
+        assert (ref is other) == (kind != "unrelated")
         rectified = not ref.files["posed"]
-        missed, distrusted = kind == "K-2" and rectified, kind == "right" and not rectified
-        status = "not trusted" if distrusted or (kind != "right" and not missed) else "trusted"
+        missed, distrusted = kind == "K-2" and rectified, kind in RIGHT and not rectified
+        status = "not trusted" if distrusted or (kind not in RIGHT and not missed) else "trusted"
         off = 0.01 if kind == "right" else 0.5
         return {"rectified": rectified, "status": status, "said": [], "off": off}
 
@@ -135,12 +142,15 @@ def test_trust_counts_and_goes_on(tmp_path, monkeypatch, weights):
     weights.append("trained further")
     calibrations.run_trust("trust", options)
     assert len(asked) == 12
+    calibrations.run_trust("trust", replace(options, kinds=()))
+    assert asked[12:] == [kind for kind in [*RIGHT[1:], *WRONG] if kind not in ("swapped", "K-2")] * 2
 
 
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
         ({"kinds": ("bent",)}, "--kinds must be one of K-0.67"),
+        ({"kinds": ("unrelated",)}, "without 'unrelated' where a pair is alone"),
         ({}, "the truth of synthetic/seed0004 must be known"),
         ({"rendered": 0}, "--data must be given, or --rendered above 0"),
         ({"limit": -1}, "--limit must be between 1"),

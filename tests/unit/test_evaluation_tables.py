@@ -151,6 +151,8 @@ def test_table1_runs_what_is_there_and_tells_how_to_obtain_the_rest(
     out = tmp_path / "out"
     said = invoke("table1", "--data", scene, "-o", out)
     tables = json.loads((out / "table1.json").read_text())["tables"]
+    latex = (out / "table1.tex").read_text()
+    assert r"\multicolumn{3}{c}{Booster (not found)}" in latex and r"AbsRel $\downarrow$ &" in latex
     assert all(cell in said for table in tables for row in table["rows"] for cell in row)
     assert "Middlebury (middlebury2014, 1 pair): AbsRel ↓" in said
     assert "KITTI-Stereo was not found. To obtain it: data_scene_flow.zip" in said
