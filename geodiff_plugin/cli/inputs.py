@@ -21,7 +21,7 @@ from geodiff_plugin.cli.options import PARAMETERS, DepthOptions
 from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
-from geodiff_plugin.formats.depth import depth_of_disparity, read_map
+from geodiff_plugin.formats.depth import depth_of_disparity, read_confidence, read_map
 from geodiff_plugin.formats.lenses import (
     distortion_from_text,
     intrinsics_from_exif,
@@ -31,7 +31,6 @@ from geodiff_plugin.formats.lenses import (
     undistorted_points,
     warn_of_other_lens,
 )
-from geodiff_plugin.formats.points import read_confidence
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
 from geodiff_plugin.guidance.evidence import cleaned
 from geodiff_plugin.guidance.guidance import GeometryGuidance, assume_same_centre

@@ -22,7 +22,7 @@ _MODULE_OF = {
     "read_image": "images",
     "read_matrix": "files",
     "read_pfm": "depth",
-    "read_points": "points",
+    "read_points": "depth",
     "read_text": "files",
     "rig_from_parameters": "rigs",
     "write_colmap": "sfm",

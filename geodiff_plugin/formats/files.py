@@ -28,7 +28,6 @@ if TYPE_CHECKING:  # what is wrong with a file is said before numpy is imported
     import numpy as np
     from PIL import Image
 
-HEIC = (".heic", ".heif")
 #: A number whose decimals follow a comma, alone between blanks, semicolons or the ends of a line.
 DECIMAL_COMMA = re.compile(r"(?<![^\s;])[-+]?\d+,\d+(e[-+]?\d+)?(?![^\s;])", re.IGNORECASE)
 #: No calibration file is near this size; a larger one is something else.
@@ -64,20 +63,13 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
 
 @contextmanager
 def open_image(path: str | os.PathLike[str], name: str, what: str = "an image file") -> Iterator[Image.Image]:
-    """Open an image file with Pillow, HEIC by pillow-heif where that is installed; no pixel is read yet.
+    """Open an image file with Pillow; no pixel is read yet.
 
     What is no image, too large, or damaged, which may show in the block only, is refused.
     """
     from PIL import Image, UnidentifiedImageError
 
     file = check_file(path, name, what)
-    if file.suffix.lower() in HEIC:
-        try:
-            import pillow_heif
-        except ImportError:
-            cure = "Run: pip install pillow-heif, or convert it to PNG or JPEG."
-            bad_value(name, what, f"{file}, which Pillow reads with pillow-heif only", cure)
-        pillow_heif.register_heif_opener()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # what is too large is an error
@@ -86,14 +78,10 @@ def open_image(path: str | os.PathLike[str], name: str, what: str = "an image fi
             yield image
     except InputError:
         raise
-    except Image.DecompressionBombError:
-        expected = f"an image of at most {2 * (Image.MAX_IMAGE_PIXELS or 0) // 1_000_000} megapixels"
-        bad_value(name, expected, f"{file}, a larger one", "Scale it down first, and K with it.")
     except UnidentifiedImageError:
-        cure = "Convert it to PNG or JPEG."
-        bad_value(name, what, f"{file}, a format that Pillow does not read", cure)
-    except (OSError, SyntaxError, ValueError, EOFError, zlib.error) as error:
-        cure = "Is it cut off? Fetch it again."
+        bad_value(name, what, f"{file}, a format that Pillow does not read", "Convert it to PNG or JPEG.")
+    except (Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError, zlib.error) as error:
+        cure = "Is it cut off, or too large?"
         bad_value(name, "a whole image file", f"{file}, which does not decode ({error})", cure)
 
 

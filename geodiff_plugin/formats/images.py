@@ -21,23 +21,12 @@ ORIENTATION, TURNS = 0x0112, range(2, 9)
 #: 16-bit values that all lie below this are those of a camera of 10 or 12 bits, as they come.
 DARK_16_BITS = 8192
 CHANNELS = (1, 3, 4)
-#: Formats of Pillow whose files may hold several frames or pages that are pictures of their own; what goes
-#: with a phone's JPEG is none.
-MANY_FRAMES = ("GIF", "PNG", "TIFF", "WEBP")
 
 
 def _check_sides(width: int, height: int, name: str) -> None:
     if min(height, width) < MIN_SIDE:
         expected = f"at least {MIN_SIDE} pixels a side"
         bad_value(name, expected, f"{width}x{height}", "Is this a thumbnail or a latent?")
-
-
-def _notes_of(image: Image.Image, name: str) -> tuple[bool, list[str]]:
-    """Whether an image has 16 bits, of which Pillow loads 8 of a coloured one, and what to say of frames."""
-    deep = any(";16" in str(tile[3]) for tile in getattr(image, "tile", ()))
-    frames = getattr(image, "n_frames", 1) if image.format in MANY_FRAMES else 1
-    notes = [f"{name} holds {frames} frames or pages; only the first is taken."] if frames > 1 else []
-    return deep, notes
 
 
 def _array_of(image: Image.Image, name: str) -> np.ndarray:
@@ -54,16 +43,15 @@ def _array_of(image: Image.Image, name: str) -> np.ndarray:
     return np.asarray(image.convert("RGBA" if alpha else "RGB"))
 
 
-def _to_01(value: np.ndarray, name: str, has_16_bits: bool = False) -> tuple[np.ndarray, list[str]]:
+def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
     """``(H, W, 3)`` float32 in [0, 1] of ``(H, W)`` or ``(H, W, C)`` numbers, and what to say of them."""
     value, notes = value[..., None] if value.ndim == 2 else value, []
     if value.shape[-1] == 4:
         value, notes = value[..., :3], [f"{name} has an alpha channel; it is dropped."]
     if value.dtype in (np.uint8, np.uint16):
-        most = int(value.max()) * (1 if value.dtype == np.uint16 else 257)
-        if most < DARK_16_BITS and (has_16_bits or value.dtype == np.uint16):
+        if value.dtype == np.uint16 and value.max() < DARK_16_BITS:
             notes.append(
-                f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535. "
+                f"{name} is a 16-bit image that is nearly black: its values reach {value.max()} of 65535. "
                 "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
             )
         value = value.astype(np.float32) / np.iinfo(value.dtype).max
@@ -90,36 +78,30 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
         OSError, ValueError: no readable file; not an image, cut off, or a side under 32 pixels.
     """
     with open_image(path, name) as image:
-        deep, notes = _notes_of(image, name)
-        image.seek(0)
         image.load()
         is_turned = image.getexif().get(ORIENTATION) in TURNS
         upright = ImageOps.exif_transpose(image)
-    image_01, more = _to_01(_array_of(upright, name), name, deep)
+    image_01, notes = _to_01(_array_of(upright, name), name)
     if is_turned:
-        more.append(
+        notes.append(
             f"{name} was turned or mirrored to {upright.width}x{upright.height}, as its EXIF orientation "
             "says; K must belong to the turned image."
         )
-    return image_01, notes + more
+    return image_01, notes
 
 
 def _hwc(value: Any, name: str) -> np.ndarray:
     """``(H, W, C)``, C of 1, 3 or 4, of an array with channels last or a tensor with channels first."""
+    if not isinstance(value, (torch.Tensor, np.ndarray)):
+        bad_type(name, "a PIL image, a numpy array or a torch tensor", value)
     if isinstance(value, torch.Tensor):
         channels, shape, turn = 0, "(3, H, W)", "torch images start with channels: value.permute(2, 0, 1)."
-        cures = {4: "Take one image of the batch: value[0].", 2: "Add a channel axis: value[None].", 3: turn}
-    elif isinstance(value, np.ndarray):
-        value = value[..., None] if value.ndim == 2 else value
-        channels, shape, turn = (
-            -1,
-            "(H, W, 3) or (H, W)",
-            "numpy images end in them: value.transpose(1, 2, 0).",
-        )
-        cures = {4: "Take one image of the batch.", 3: turn}
     else:
-        bad_type(name, "a PIL image, a numpy array or a torch tensor", value)
+        value = value[..., None] if value.ndim == 2 else value
+        channels, shape = -1, "(H, W, 3) or (H, W)"
+        turn = "numpy images end in channels: value.transpose(1, 2, 0)."
     if value.ndim != 3 or value.shape[channels] not in CHANNELS:
+        cures = {2: "Add a channel axis: value[None].", 3: turn, 4: "Take one image of the batch: value[0]."}
         expected = f"an image of shape {shape}, of 1, 3 or 4 channels"
         bad_value(name, expected, f"shape {tuple(value.shape)}", cures.get(value.ndim, ""))
     if isinstance(value, torch.Tensor):
@@ -156,14 +138,12 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
         ValueError: wrong rank or channels, NaN or infinity, floats outside [0, 1], a side under 32 pixels.
     """
     if isinstance(value, Image.Image):
-        deep, notes = _notes_of(value, name)
+        hwc, notes = _to_01(_array_of(value, name), name)
         if value.getexif().get(ORIENTATION) in TURNS:
             notes.append(
                 f"{name} carries an EXIF orientation that is not applied; "
                 "turn it with PIL.ImageOps.exif_transpose and give the K of the turned image."
             )
-        hwc, more = _to_01(_array_of(value, name), name, deep)
-        notes += more
     else:
         hwc, notes = _to_01(_hwc(value, name), name)
     for note in notes:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import io
-import sys
 import warnings
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -85,9 +83,8 @@ def test_other_modes_become_rgb_and_alpha_is_dropped(tmp_path, image, expected, 
 
 @pytest.mark.parametrize(("times", "told"), [(4, True), (16, True), (257, False)])
 def test_10_and_12_bits_in_16_are_told_once(tmp_path, times, told):
-    """Of coloured files Pillow keeps the upper 8 bits, which leaves 16 levels and no mode that tells."""
     colour = RAMP.astype(np.uint16) * times
-    grey, deep = colour[..., 0], np.dstack([colour, np.full((H, W), 65535, np.uint16)])
+    grey = colour[..., 0]
     said = read_image(saved(tmp_path, Image.fromarray(grey)))[1]
     assert len(said) == told
     assert not told or f"its values reach {grey.max()} of 65535" in said[0] and "by 16; with 10" in said[0]
@@ -95,13 +92,6 @@ def test_10_and_12_bits_in_16_are_told_once(tmp_path, times, told):
     for value in (*kinds, Image.fromarray(grey)):
         assert ["nearly black" in sentence for sentence in heard(value)] == [True] * told
     assert heard(RAMP // 8) == []
-    for channels in (3, 4):
-        path = tmp_path / f"{channels}.png"
-        assert cv2.imwrite(str(path), deep[..., :channels])
-        notes = [note for note in read_image(path)[1] if "alpha" not in note]
-        assert ["is a 16-bit image that is nearly black" in note for note in notes] == [True] * told
-        with Image.open(path) as image:
-            assert [sentence for sentence in heard(image) if "alpha" not in sentence] == notes
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "webp"])
@@ -119,38 +109,13 @@ def test_a_cut_off_image_is_a_sentence(tmp_path, suffix):
         read_image(path)
 
 
-@pytest.mark.parametrize("name", ["x.gif", "x.png", "x.tiff", "x.webp"])
-def test_only_the_first_of_several_frames_is_taken_and_told(tmp_path, name):
-    more = {"lossless": True} if name == "x.webp" else {}
-    path = saved(tmp_path, PIL, name, save_all=True, append_images=[Image.fromarray(RAMP[::-1])], **more)
-    image, notes = read_image(path)
-    assert notes == ["left holds 2 frames or pages; only the first is taken."]
-    np.testing.assert_allclose(image, X, atol=0.15 if name == "x.gif" else 0)  # 256 colours
-    with Image.open(path) as opened:
-        assert heard(opened) == notes
-    assert read_image(saved(tmp_path, PIL, "one.gif"))[1] == []
-
-
 def test_an_image_beyond_pillows_limit_says_so(tmp_path, monkeypatch):
     path = saved(tmp_path, PIL)
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", H * W - 1)
     assert read_image(path)[1] == []  # beyond Pillow's warning alone
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", H * W // 3)
-    with pytest.raises(ValueError, match=r"at most 0 megapixels; got .*x\.png, a larger one\. Scale it down"):
+    with pytest.raises(ValueError, match=r"x\.png, which does not decode .*pixels.*too large"):
         read_image(path)
-
-
-def test_heic_is_read_where_pillow_heif_is(tmp_path, monkeypatch):
-    path = tmp_path / "x.HEIC"
-    path.write_bytes(b"no image")
-    monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(ValueError, match="pillow-heif only. Run: pip install pillow-heif"):
-        read_image(path)
-    monkeypatch.undo()
-    heif = pytest.importorskip("pillow_heif")
-    heif.from_pillow(PIL).save(path, quality=-1)
-    image, notes = read_image(path)
-    assert notes == [] and np.abs(image - X).mean() < 0.02
 
 
 TENSOR = torch.from_numpy(X).permute(2, 0, 1)

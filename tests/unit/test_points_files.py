@@ -8,7 +8,7 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.formats import read_points, write_depth_mm, write_pfm
-from geodiff_plugin.formats.points import read_confidence
+from geodiff_plugin.formats.depth import read_confidence
 
 MAP = np.zeros((6, 8), np.float32)
 MAP[1, 2], MAP[4, 5] = 1.25, 3.5
