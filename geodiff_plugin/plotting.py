@@ -131,17 +131,22 @@ def colour_share(values: np.ndarray, top: float = 1.0) -> np.ndarray:
     return _coloured(values, np.isfinite(values), lambda v: v / top, SHARE_COLOURS)
 
 
-def _drawn(picture: np.ndarray, draw: Callable[[Any], None]) -> Image.Image:
-    """A picture ``(H, W, 3)`` of uint8 with what matplotlib draws over it."""
+def rasterised(figure: Any) -> Image.Image:
+    """The pixels of a matplotlib figure, drawn without any global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+
+
+def _sheet(picture: np.ndarray) -> Any:
+    """A matplotlib figure that shows a picture ``(H, W, 3)`` of uint8 pixel by pixel."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(picture.shape[1] / DPI, picture.shape[0] / DPI), dpi=DPI)
-    canvas = FigureCanvasAgg(figure)
     figure.figimage(picture, zorder=-1)  # below the axes
-    draw(figure)
-    canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    return figure
 
 
 def _figure(
@@ -156,22 +161,20 @@ def _figure(
     wide, letters = sheet.shape[1], {"fontsize": size * POINTS_PER_PIXEL}
     x, thick = (picture.shape[1] + gap) / wide, bar / wide
 
-    def draw(figure: Any) -> None:
-        low = size * (3 if unknown else 1)
-        axes = figure.add_axes((x, low / high, thick, (high - 2 * size - low) / high))
-        ramp = np.linspace(0, 1, 512)[:, None]
-        axes.imshow(ramp, cmap=colours, aspect="auto", origin="lower", extent=(0, 1, 0, 1))
-        axes.set_xticks([])
-        axes.yaxis.tick_right()
-        axes.set_yticks([share for share, _ in marks], [text for _, text in marks], **letters)
-        axes.tick_params(length=size * POINTS_PER_PIXEL / 3, pad=size * POINTS_PER_PIXEL / 4)
-        figure.text(x, 1 - 0.9 * size / high, label, va="center", **letters)
-        if unknown:
-            key = figure.add_axes((x, size / high, thick, size / high), facecolor=str(GREY / 255))
-            key.set(xticks=[], yticks=[])
-            figure.text(x + thick + size / 2 / wide, 1.5 * size / high, "none", va="center", **letters)
-
-    return _drawn(sheet, draw)
+    figure, low = _sheet(sheet), size * (3 if unknown else 1)
+    axes = figure.add_axes((x, low / high, thick, (high - 2 * size - low) / high))
+    ramp = np.linspace(0, 1, 512)[:, None]
+    axes.imshow(ramp, cmap=colours, aspect="auto", origin="lower", extent=(0, 1, 0, 1))
+    axes.set_xticks([])
+    axes.yaxis.tick_right()
+    axes.set_yticks([share for share, _ in marks], [text for _, text in marks], **letters)
+    axes.tick_params(length=size * POINTS_PER_PIXEL / 3, pad=size * POINTS_PER_PIXEL / 4)
+    figure.text(x, 1 - 0.9 * size / high, label, va="center", **letters)
+    if unknown:
+        key = figure.add_axes((x, size / high, thick, size / high), facecolor=str(GREY / 255))
+        key.set(xticks=[], yticks=[])
+        figure.text(x + thick + size / 2 / wide, 1.5 * size / high, "none", va="center", **letters)
+    return rasterised(figure)
 
 
 def depth_figure(
@@ -232,13 +235,12 @@ def grid(
         places.append((gap + k % columns * (cell_width + gap), gap + sum(heights[: k // columns])))
         sheet.paste(cell, (places[-1][0], places[-1][1] + head))
 
-    def draw(figure: Any) -> None:
-        for title, (left, top) in zip(titles, places, strict=True):
-            size = min(15, 1.7 * cell_width / max(1, len(title))) * POINTS_PER_PIXEL  # smaller if too long
-            x, y = (left + cell_width / 2) / wide, 1 - (top + head / 2) / high
-            figure.text(x, y, title, fontsize=size, parse_math=False, ha="center", va="center")
-
-    return _drawn(np.asarray(sheet), draw)
+    figure = _sheet(np.asarray(sheet))
+    for title, (left, top) in zip(titles, places, strict=True):
+        size = min(15, 1.7 * cell_width / max(1, len(title))) * POINTS_PER_PIXEL  # smaller if too long
+        x, y = (left + cell_width / 2) / wide, 1 - (top + head / 2) / high
+        figure.text(x, y, title, fontsize=size, parse_math=False, ha="center", va="center")
+    return rasterised(figure)
 
 
 def overview(

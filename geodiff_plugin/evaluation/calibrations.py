@@ -18,7 +18,7 @@ from geodiff_plugin.evaluation import experiment, tables
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import call_arguments, guided_configuration
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load
-from geodiff_plugin.evaluation.datasets.changed import changed_ref, drift_of, perturbation
+from geodiff_plugin.evaluation.datasets.sample import changed_ref, two_numbers
 from geodiff_plugin.evaluation.experiment import Page, run_experiment
 from geodiff_plugin.evaluation.options import PosesOptions, TrustOptions, real_and_rendered
 from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs, headline, label_of
@@ -78,7 +78,7 @@ def _every_pose(refs: Sequence[SampleRef]) -> Columns:
 
 def run_poses(name: str, options: PosesOptions) -> Page | None:
     """Measure two views, three where there are some, rectified pairs drifted, and rendered ones perturbed."""
-    change, drift = perturbation(options.perturb), drift_of(options.drift)
+    change, drift = two_numbers(options.perturb, "--perturb"), two_numbers(options.drift, "--drift")
     size = options.rendered_size
     if size is not None and not re.fullmatch(r"\d{2,5}x\d{2,5}", size):
         cure = "256x192 has a quarter of the usual pixels."

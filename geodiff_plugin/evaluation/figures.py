@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -22,20 +23,16 @@ from geodiff_plugin._checks import check_choice
 from geodiff_plugin.algorithm.terms import masked_mean, photometric_map
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load
-from geodiff_plugin.evaluation.datasets.changed import changed_ref
+from geodiff_plugin.evaluation.datasets.sample import changed_ref
 from geodiff_plugin.evaluation.experiment import measure_cells, method_cells, run_facts
-from geodiff_plugin.evaluation.metrics import align, evaluate_depth
-from geodiff_plugin.evaluation.options import FigureOptions, all_refs, select
-from geodiff_plugin.evaluation.tables import (
-    ValueOf,
-    count_of_pairs,
-    headline,
-    mean_with_interval,
-)
+from geodiff_plugin.evaluation.metrics import evaluate_depth
+from geodiff_plugin.evaluation.options import FigureOptions, select
+from geodiff_plugin.evaluation.scoring import in_metres
+from geodiff_plugin.evaluation.tables import ValueOf, count_of_pairs, grouped, headline, mean_with_interval
 from geodiff_plugin.formats import as_image_01, atomic_path
 from geodiff_plugin.formats.out import write_text
 from geodiff_plugin.geometry import project, resize_intrinsics, transform, unproject, warp_right_to_left
-from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, grid, ticks
+from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, grid, rasterised, ticks
 from geodiff_plugin.runner import Record
 from geodiff_plugin.scale.space import SPACES, smooth_floor
 
@@ -48,7 +45,7 @@ MARKERS = "osD^vP"
 EXPOSURE_METHODS = ("paper", "guided", "sgbm")
 #: Half and twice the light, and the steps between; also exponents.
 GAINS = (0.5, 0.7, 1.0, 1.4, 2.0)
-PRESETS = ("guided", "paper")
+PRESETS, SECONDS = ("guided", "paper"), itemgetter("seconds")
 
 
 def _new_figure(width_in: float, height_in: float) -> Any:
@@ -58,13 +55,10 @@ def _new_figure(width_in: float, height_in: float) -> Any:
 
 def _save_png(picture: Any, path: Path) -> None:
     """Write a picture whole or not at all, in 256 colours, which are enough and a third of the size."""
-    if isinstance(picture, Figure):
-        drawn = io.BytesIO()
-        picture.savefig(drawn, format="png", metadata={"Software": None})
-        picture = Image.open(drawn).convert("RGB")
+    image = rasterised(picture) if isinstance(picture, Figure) else picture
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
-        picture.quantize(256, kmeans=1, dither=Image.Dither.NONE).save(temporary, format="PNG", optimize=True)
+        image.quantize(256, kmeans=1, dither=Image.Dither.NONE).save(temporary, format="PNG", optimize=True)
 
 
 def _style(index: int) -> dict[str, Any]:
@@ -91,78 +85,63 @@ def _plain_log_axis(axis: Any, low: float, high: float) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def _references(options: FigureOptions) -> list[SampleRef]:
-    """The samples that a figure shows, their poses perturbed where the options say so."""
-    return options.changed(select(all_refs(options), options))
-
-
 def _records(options: FigureOptions, refs: Sequence[SampleRef], methods: Sequence[str]) -> list[Record]:
     return measure_cells(method_cells(refs, methods, options.settings, options.out), options) or []
 
 
-def _curve(
-    axes: Any,
-    x: Sequence[float],
-    groups: Sequence[Sequence[Record]],
-    value_of: ValueOf,
-    index: int,
-    name: str,
-) -> list[float | None]:
-    """A line through the mean of each group, with a band where all have intervals; returns the means."""
-    of_groups = [[value_of(record) for record in group if record["status"] == "ok"] for group in groups]
-    means = [mean_with_interval([v for v in values if v is not None]) for values in of_groups]
-    known = [(at, mean) for at, mean in zip(x, means, strict=True) if mean.count]
-    at, marks = [place for place, _ in known], _style(index)
-    if known:
-        axes.plot(at, [mean.value for _, mean in known], label=find_method(name).title, **marks)
-    if known and all(mean.low is not None for _, mean in known):
-        low, high = [mean.low for _, mean in known], [mean.high for _, mean in known]
-        axes.fill_between(at, low, high, color=marks["color"], alpha=0.15, linewidth=0)
-    return [mean.value if mean.count else None for mean in means]
+def _curves(
+    axes: Any, x: Sequence[float], groups: Mapping[str, Sequence[Sequence[Record]]], value_of: ValueOf
+) -> dict[str, list[float | None]]:
+    """A line for each method through the means of its groups of records, a band where all have intervals."""
+    drawn: dict[str, list[float | None]] = {}
+    for index, (name, of_method) in enumerate(groups.items()):
+        done = [[value_of(record) for record in own if record["status"] == "ok"] for own in of_method]
+        means, marks = list(map(mean_with_interval, done)), _style(index)
+        axes.plot(x, [mean.value for mean in means], label=find_method(name).title, **marks)
+        if all(mean.low is not None for mean in means):
+            low, high = [mean.low for mean in means], [mean.high for mean in means]
+            axes.fill_between(x, low, high, color=marks["color"], alpha=0.15, linewidth=0)
+        drawn[name] = [mean.value if mean.count else None for mean in means]
+    return drawn
 
 
 def draw_inner_steps(options: FigureOptions) -> Drawing:
     """Error and seconds against updates per denoising step, for both presets."""
-    updates, refs = sorted(set(options.updates)), _references(options)
+    updates, refs = sorted(set(options.updates)), select(options)
     methods = {preset: [f"{preset}:inner_steps={n}" for n in updates] for preset in PRESETS}
-    records = _records(options, refs, [name for names in methods.values() for name in names])
-    figure = _new_figure(7.6, 3.1)
-    numbers: dict[str, Any] = {"samples": [ref.label for ref in refs], "updates": updates}
-    numbers |= {preset: {} for preset in PRESETS}
-    quantities: dict[str, tuple[str, ValueOf]] = {
-        "abs_rel": ("AbsRel", headline),
-        "seconds": ("seconds a pair", itemgetter("seconds")),
-    }
+    records = grouped(_records(options, refs, list(chain(*methods.values()))), "method")
+    groups = {preset: [records.get(name, []) for name in names] for preset, names in methods.items()}
+    figure, numbers = _new_figure(7.6, 3.1), {"samples": [ref.label for ref in refs], "updates": updates}
     panels = figure.subplots(1, 2)
-    for axes, (key, (title, value_of)) in zip(panels, quantities.items(), strict=True):
-        for index, (preset, names) in enumerate(methods.items()):
-            groups = [[record for record in records if record["method"] == name] for name in names]
-            numbers[preset][key] = _curve(axes, updates, groups, value_of, index, preset)
+    errors, seconds = (_curves(panels[k], updates, groups, v) for k, v in enumerate((headline, SECONDS)))
+    for axes, title in zip(panels, ("AbsRel", "seconds a pair"), strict=True):
         _name_axes(axes, "updates per denoising step", title, updates)
         axes.set_ylim(bottom=0)
     panels[1].legend(fontsize=8)
     figure.suptitle(count_of_pairs(len(refs)), fontsize=9)
-    return figure, numbers
+    return figure, numbers | {p: {"abs_rel": errors[p], "seconds": seconds[p]} for p in PRESETS}
 
 
 def draw_exposure(options: FigureOptions) -> Drawing:
     """Error against gain and against gamma of the right view; the left view stays as it is."""
-    methods, refs = options.methods or EXPOSURE_METHODS, _references(options)
+    methods, refs = options.methods or EXPOSURE_METHODS, select(options)
     changes = {"gain": [(gain, 1.0) for gain in GAINS], "gamma": [(1.0, gamma) for gamma in GAINS]}
     every = dict.fromkeys(changes["gain"] + changes["gamma"])
     exposed = {change: [changed_ref(ref, "right_exposure", change) for ref in refs] for change in every}
-    records = _records(options, [ref for changed in exposed.values() for ref in changed], methods)
-    figure = _new_figure(7.6, 3.1)
-    numbers: dict[str, Any] = {"samples": [ref.label for ref in refs]}
+    records = _records(options, list(chain(*exposed.values())), methods)
+    of_sample = grouped(records, "method", "dataset", "sample")
+
+    def of_change(method: str, change: tuple[float, float]) -> list[Record]:
+        keys = [(method, ref.dataset, ref.name) for ref in exposed[change]]
+        return [record for key in keys for record in of_sample.get(key, [])]
+
+    figure, numbers = _new_figure(7.6, 3.1), dict[str, Any](samples=[ref.label for ref in refs])
     panels, drawn = figure.subplots(1, 2, sharey=True), list[float]()
-    for axes, name in zip(panels, changes, strict=True):
-        numbers[name] = {"values": list(GAINS)}
-        samples = [{ref.name for ref in exposed[change]} for change in changes[name]]
-        for index, method in enumerate(methods):
-            measured = [record for record in records if record["method"] == method]
-            groups = [[record for record in measured if record["sample"] in names] for names in samples]
-            numbers[name][method] = _curve(axes, GAINS, groups, headline, index, method)
-            drawn += [value for value in numbers[name][method] if value]
+    for axes, (name, values) in zip(panels, changes.items(), strict=True):
+        groups = {method: [of_change(method, change) for change in values] for method in methods}
+        curves = _curves(axes, GAINS, groups, headline)
+        numbers[name] = {"values": list(GAINS)} | curves
+        drawn += filter(None, chain(*curves.values()))
         _name_axes(axes, f"{name} of the right view", "AbsRel" if name == "gain" else "", GAINS)
     if drawn:  # errors of good and bad methods are decades apart
         _plain_log_axis(panels[0].yaxis, min(drawn), max(drawn))
@@ -190,16 +169,14 @@ def draw_strength(
     ``pictures`` are shaded crops by their titles.
     """
     figure = _new_figure(11.0, 4.4)
-    grid = figure.add_gridspec(2, 4)
-    axes = figure.add_subplot(grid[:, :2])
-    errors: dict[str, dict[str, list[float]]] = {}
-    for record in records:
-        of_method = errors.setdefault(record["method"], {})
-        of_method.setdefault(record["strength"], []).append(record["abs_rel"])
-    at = {strength: float(np.mean(values)) for strength, values in errors.pop(oracle).items()}
+    parts = figure.add_gridspec(2, 4)
+    axes = figure.add_subplot(parts[:, :2])
+    groups = grouped(records, "method", "strength").items()
+    errors = {key: float(np.mean([record["abs_rel"] for record in own])) for key, own in groups}
+    at = {strength: error for (method, strength), error in errors.items() if method == oracle}
     ordered = sorted(at, key=at.__getitem__)
-    for index, (method, values) in enumerate(errors.items()):
-        means = [float(np.mean(values[strength])) for strength in ordered]
+    for index, method in enumerate(dict.fromkeys(method for method, _ in errors if method != oracle)):
+        means = [errors[method, strength] for strength in ordered]
         axes.plot([at[s] for s in ordered], means, label=find_method(method).title, **_style(index))
     ends = (min(at.values()) * 0.8, max(at.values()) * 1.2)
     axes.plot(ends, ends, color="0.6", linestyle="--", linewidth=1, label=find_method(oracle).title)
@@ -207,7 +184,7 @@ def draw_strength(
     _name_axes(axes, "AbsRel of the prior, aligned by an oracle", "AbsRel in metres")
     axes.legend(fontsize=8)
     for k, (title, picture) in enumerate(pictures.items()):
-        panel = figure.add_subplot(grid[k // 2, 2 + k % 2])
+        panel = figure.add_subplot(parts[k // 2, 2 + k % 2])
         panel.imshow(picture, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         panel.set_title(title, fontsize=8)
         panel.set_axis_off()
@@ -280,9 +257,9 @@ def _sweep_curves(axes: Any, g_s_m: np.ndarray, loss: np.ndarray, abs_rel: np.nd
 
 def draw_gs_sweep(options: FigureOptions) -> Drawing:
     """L_geo and AbsRel of the first sample against g_s, with re-rendered left images (fig:lossAbs1)."""
-    sample = load(_references(options)[0]).check_truth()
+    sample = load(select(options)[0]).check_truth()
     prior = METHODS["prior-aligned"].run(sample, options.settings, PriorCache())
-    assert prior.relative is not None
+    assert prior.relative is not None  # a plain call has no metres
     sweep, rendered = sweep_g_s(sample, prior.relative, prior.space, options.max)
     figure = _new_figure(8.6, 4.9)
     upper, lower = figure.subfigures(2, 1, height_ratios=[2.0, 1.0])
@@ -298,8 +275,6 @@ def draw_gs_sweep(options: FigureOptions) -> Drawing:
     return figure, {"sample": sample.label} | {name: values.tolist() for name, values in sweep.items()}
 
 
-ABLATION_METHODS = ("prior-aligned", "reprojection-only", "guided")
-QUALITATIVE_METHODS = ("prior-aligned", "paper", "sweep-sgm", "guided")
 YAW_DEGREES, PITCH_DEGREES = -25.0, 12.0
 #: A picture of points is drawn this much smaller than the map that they come from, which closes its holes.
 SHRINK = 0.6
@@ -344,41 +319,31 @@ def render_cloud(
 
 def _answer(
     sample: StereoSample, name: str, settings: Settings, priors: PriorCache
-) -> tuple[str, np.ndarray | None, float | None]:
-    """Title, depth ``(H, W)`` and AbsRel of a method, both ``None`` where it cannot work on the sample.
-
-    Relative depth gets scale and shift from the truth; an empty map has no AbsRel.
-    """
+) -> tuple[str, np.ndarray, float | None]:
+    """Title, depth ``(H, W)`` and AbsRel of a method; an empty map without AbsRel where it cannot work."""
     method = find_method(name)
     try:
         prediction = method.run(sample, method.own_settings(settings), priors)
     except NotApplicable as reason:
-        return f"{method.title}: {reason}", None, None
-    depth_m = prediction.depth_m
-    if depth_m is None:
-        assert prediction.relative is not None
-        depth_m = align(prediction.relative, sample.depth_m, sample.valid, prediction.space)
+        return f"{method.title}: {reason}", np.full(sample.depth_m.shape, np.nan), None
+    depth_m = in_metres(prediction, sample.depth_m, sample.valid)
     abs_rel = evaluate_depth(depth_m, sample.depth_m, sample.valid)["abs_rel"]
     if math.isnan(abs_rel):
         return method.title, depth_m, None
     return f"{method.title}, AbsRel {abs_rel:.3f}", depth_m, abs_rel
 
 
-def _relative_error(depth_m: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """``(H, W)``, NaN without truth or prediction."""
-    return np.where(depth_m > 0, np.abs(depth_m - truth) / truth, np.nan)
-
-
 def _rows(
-    sample: StereoSample, answers: Sequence[tuple[str, np.ndarray | None, Any]], clouds: bool
+    sample: StereoSample, answers: Sequence[tuple[str, np.ndarray, Any]], clouds: bool
 ) -> tuple[list[np.ndarray], list[str]]:
     """Pictures of a sample, with titles: depth beside the left image, errors beside the truth, clouds."""
     truth = np.where(sample.valid, sample.depth_m, np.nan)
     near, far = depth_range(truth)
-    depths = [np.full(truth.shape, np.nan) if depth_m is None else depth_m for _, depth_m, _ in answers]
+    depths = [depth_m for _, depth_m, _ in answers]
     pictures = [sample.left]
     pictures += [colour_depth(depth_m, near=near, far=far) for depth_m in (*depths, truth)]
-    pictures += [colour_share(_relative_error(depth_m, truth), WORST_SHOWN) for depth_m in depths]
+    errors = [np.where(depth_m > 0, np.abs(depth_m - truth) / truth, np.nan) for depth_m in depths]
+    pictures += [colour_share(error, WORST_SHOWN) for error in errors]
     titles = [sample.name, *(title for title, _, _ in answers), f"truth, {near:.3g} m to {far:.3g} m"]
     titles += [f"error, 0 to {WORST_SHOWN:.0%} of the depth"] * len(answers)
     if clouds:
@@ -388,10 +353,11 @@ def _rows(
     return pictures, titles
 
 
-def _side_by_side(options: FigureOptions, methods: Sequence[str]) -> Drawing:
-    samples, priors = [load(ref).check_truth() for ref in _references(options)], PriorCache()
+def draw_side_by_side(shown: Sequence[str], options: FigureOptions) -> Drawing:
+    """Depth and errors of every method, sample by sample; ``shown`` are those that no option names."""
+    methods, priors = options.methods or shown, PriorCache()
     cells, titles, numbers = list[np.ndarray](), list[str](), dict[str, Any]()
-    for sample in samples:
+    for sample in [load(ref).check_truth() for ref in select(options)]:
         answers = [_answer(sample, name, options.settings, priors) for name in methods]
         pictures, headings = _rows(sample, answers, options.clouds)
         cells, titles = cells + pictures, titles + headings
@@ -399,22 +365,12 @@ def _side_by_side(options: FigureOptions, methods: Sequence[str]) -> Drawing:
     return grid(cells, titles, columns=1 + len(methods)), {"abs_rel": numbers}
 
 
-def draw_ablation(options: FigureOptions) -> Drawing:
-    """The prior, the reprojection loss without diffusion, and both together."""
-    return _side_by_side(options, options.methods or ABLATION_METHODS)
-
-
-def draw_qualitative(options: FigureOptions) -> Drawing:
-    """Every chosen method."""
-    return _side_by_side(options, options.methods or QUALITATIVE_METHODS)
-
-
 FIGURES: dict[str, Callable[[FigureOptions], Drawing]] = {
     "gs-sweep": draw_gs_sweep,
     "inner-steps": draw_inner_steps,
-    "ablation": draw_ablation,
+    "ablation": partial(draw_side_by_side, ("prior-aligned", "reprojection-only", "guided")),
     "exposure": draw_exposure,
-    "qualitative": draw_qualitative,
+    "qualitative": partial(draw_side_by_side, ("prior-aligned", "paper", "sweep-sgm", "guided")),
 }
 """Every figure by name."""
 

@@ -1,7 +1,7 @@
-"""Errors of depth, disparity and uncertainty against the truth, and alignment with it (paper S5.1).
+"""Errors of depth, disparity, uncertainty and edges against the truth, and alignment with it (paper S5.1).
 
-Maps are ``(H, W)``: ``pred_m`` and ``truth_m`` float, metres; ``valid`` bool, where the truth counts. A
-prediction is not finite, or not positive, where a method leaves a hole; holes count in no mean.
+Maps are ``(H, W)``: ``pred_m`` and ``truth_m`` float, metres; disparity in pixels; ``valid`` bool, where the
+truth counts. A prediction is not finite, or not positive, where a method leaves a hole; holes count nowhere.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from scipy import ndimage
 
 from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.evaluation.options import CROPS
@@ -126,18 +127,17 @@ def ause(
 ) -> float:
     """Area under the sparsification error: how badly the uncertainty sorts pixels by their error.
 
-    The share ``k / steps`` of the least certain pixels is left out, the mean relative error of the rest is
-    compared with the same where the worst pixels are left out, and the difference is averaged over k.
-    ``uncertainty`` is ``(H, W)``, any unit, larger is less certain; ``None``: the mean over random ones.
+    The mean relative error without the share ``k / steps`` of the least certain pixels is compared with that
+    without the worst ones, and the difference is averaged over k. ``uncertainty`` is ``(H, W)``, any unit,
+    larger is less certain; ``None``: the mean over random ones.
 
     Returns:
-        In AbsRel's unit, at least 0; 0 where the order of the pixels is the order of their errors.
+        In AbsRel's unit, at least 0; 0 where the order of the pixels is that of their errors.
 
     Raises:
         ValueError: shapes differ, or no pixel has truth, prediction and uncertainty.
 
-    Source: Ilg et al., "Uncertainty Estimates and Multi-Hypotheses Networks for Optical Flow", S5; on AbsRel
-    here.
+    Source: Ilg et al., "Uncertainty Estimates and Multi-Hypotheses Networks for Optical Flow", S5.
     """
     known = truth_m if uncertainty is None else uncertainty
     _check_maps(pred_m=pred_m, truth_m=truth_m, valid=valid, uncertainty=known)
@@ -184,13 +184,11 @@ def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str
     """Depth in metres of ``values`` that are right up to scale and shift in a key of ``SPACES``.
 
     Returns:
-        ``(H, W)`` float64, metres, at least ``FLOOR_M``, where Marigold's evaluation clips what least
-        squares sends behind the camera, and at most a kilometre where values fall with depth; not finite
-        where ``values`` is not, and nowhere finite where no pixel has both truth and prediction.
+        ``(H, W)`` float64, metres, at least ``FLOOR_M``, and at most a kilometre where values fall with
+        depth; not finite where ``values`` is not, nor anywhere if no pixel has both truth and prediction.
 
     Source: Marigold's evaluation: ``least_square`` and ``least_square_disparity``, the latter over positive
-        predictions only and clipped at 1e-3; the other spaces are the same idea. Without its optional
-        downscaling, in float64.
+        predictions only and clipped at 1e-3; the other spaces likewise.
     """
     kind, metre = SPACES[check_choice(space, "space", SPACES)], torch.ones((), dtype=torch.float64)
     known = valid & np.isfinite(values) & (truth_m > 0)
@@ -209,11 +207,8 @@ def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str
 
 
 #: Shares of the image: first and last row, first and last column.
-_SHARES = {
-    "none": (0.0, 1.0, 0.0, 1.0),
-    "garg": (0.40810811, 0.99189189, 0.03594771, 0.96405229),
-    "eigen": (0.3324324, 0.91351351, 0.0359477, 0.96405229),
-}
+_SHARES = {"none": (0, 1, 0, 1), "garg": (0.40810811, 0.99189189, 0.03594771, 0.96405229)}
+_SHARES["eigen"] = (0.3324324, 0.91351351, 0.0359477, 0.96405229)
 #: Rows and columns that every image of KITTI's depth benchmark has.
 _BENCHMARK = (352, 1216)
 
@@ -231,17 +226,160 @@ def crop_mask(name: str, size: tuple[int, int]) -> np.ndarray:
         Eigen's crop of an image that was cut to the benchmark's before; here each stands alone.
     """
     check_choice(name, "crop", CROPS)
-    height, width = size
-    if name == "benchmark":
-        rows, columns = _BENCHMARK
-        if height < rows or width < columns:
-            expected = f"'benchmark' for images of at least {columns} x {rows}"
-            bad_value("crop", expected, f"{width} x {height}", "It is for KITTI; leave --crop out.")
-        top, left = height - rows, (width - columns) // 2
-        bottom, right = top + rows, left + columns
-    else:
+    (height, width), (rows, columns), mask = size, _BENCHMARK, np.zeros(size, bool)
+    if name != "benchmark":
         sides = zip(_SHARES[name], (height, height, width, width), strict=True)
         top, bottom, left, right = (int(share * side) for share, side in sides)
-    mask = np.zeros(size, bool)
+    elif height < rows or width < columns:
+        expected = f"'benchmark' for images of at least {columns} x {rows}"
+        bad_value("crop", expected, f"{width} x {height}", "It is for KITTI; leave --crop out.")
+    else:
+        top, bottom, left = height - rows, height, (width - columns) // 2
+        right = left + columns
     mask[top:bottom, left:right] = True
     return mask
+
+
+#: A step of the true disparity between neighbours that makes an edge, and how near it "edge" reaches, pixels.
+STEP_PX, REACH_PX = 3.0, 4
+#: Ratios of neighbouring depths that Depth Pro counts as boundaries; a threshold weighs as much as its size.
+RATIOS = np.linspace(1.05, 1.25, 10)
+#: iBims-1's Canny filter of depth scaled to [0, 1], and its longest distance between two boundaries, pixels.
+CANNY_SIGMA, CANNY_LOW, CANNY_HIGH, FARTHEST_PX = np.sqrt(2.0), 0.1, 0.2, 10.0
+#: Step of log depth between neighbours that makes an edge of dense truth; how near it counts, and how far off
+#: a surface begins, pixels.
+LOG_STEP, NEAR_EDGE, OFF_EDGE = 0.08, 3, 5
+
+
+def near_disparity_steps(disparity_px: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """``(H, W)`` bool: pixels within ``REACH_PX`` of a step of the true disparity of more than ``STEP_PX``.
+
+    A step lies between two known neighbours of a row or a column.
+    """
+    step, known_px = np.zeros(valid.shape, bool), np.where(valid, disparity_px, np.nan)
+    for near, px in ((step, known_px), (step.T, known_px.T)):
+        apart = np.abs(np.diff(px)) > STEP_PX
+        near[:, 1:] |= apart
+        near[:, :-1] |= apart
+    return valid & step.any() & (ndimage.distance_transform_edt(~step) <= REACH_PX)
+
+
+def hidden_by_truth(disparity_px: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """``(H, W)`` bool: pixels of dense truth hidden in the right view of a rectified pair.
+
+    Another pixel of the row, nearer by more than 1 px of disparity, falls onto the same column of the right
+    image; pixels that fall beside the image are none.
+    """
+    target = np.rint(np.arange(valid.shape[1]) - np.where(valid, disparity_px, 0.0)).astype(int)
+    rows, columns = np.nonzero(valid & (target >= 0) & (target < valid.shape[1]))
+    shift, at = disparity_px[rows, columns], (rows, target[rows, columns])
+    nearest, hidden = np.full(valid.shape, -np.inf), np.zeros(valid.shape, bool)
+    np.maximum.at(nearest, at, shift)
+    hidden[rows, columns] = nearest[at] > shift + 1.0
+    return hidden
+
+
+def _front_of(depth_m: np.ndarray, known: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Depth of the neighbour right, left, below, above over that of a pixel, and where both are known."""
+    pairs = []
+    for depth, there in ((depth_m, known), (depth_m.T, known.T)):
+        first, second, both = depth[:, :-1], depth[:, 1:], there[:, :-1] & there[:, 1:]
+        pairs += [(second / first, both), (first / second, both)]
+    return pairs
+
+
+def boundary_f1(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) -> float:
+    """How well the boundaries of a map, of any scale, lie where those of the truth lie.
+
+    Returns:
+        In [0, 1], 1 for truth with boundaries of all four directions itself; NaN where it has none.
+
+    Source: Depth Pro, S3.2 and ``SI_boundary_F1``: F1 of foreground relations of neighbours, by four
+        directions, averaged over thresholds of their ratio. Deviation: masked, since our truth has holes.
+    """
+    known = valid & np.isfinite(pred_m) & (pred_m > 0)
+    pred, truth = (_front_of(np.where(known, m, 1.0).astype(np.float64), known) for m in (pred_m, truth_m))
+    if not any((both & (ratio > RATIOS[0])).any() for ratio, both in truth):
+        return float("nan")
+    total = 0.0
+    for threshold in RATIOS:
+        recall = precision = 0.0
+        for (ratio, both), (true_ratio, _) in zip(pred, truth, strict=True):
+            drawn, true = both & (ratio > threshold), both & (true_ratio > threshold)
+            hits = 0.25 * float((drawn & true).sum())
+            recall += hits / max(float(true.sum()), 1.0)
+            precision += hits / max(float(drawn.sum()), 1.0)
+        if recall + precision > 0:
+            total += threshold * 2 * recall * precision / (recall + precision)
+    return float(total / RATIOS.sum())
+
+
+def _canny(depth_m: np.ndarray) -> np.ndarray:
+    """``(H, W)`` bool: thin edges of a map without holes, scaled to [0, 1]."""
+    span = max(float(np.ptp(depth_m)), 1e-12)
+    smooth = ndimage.gaussian_filter((depth_m - depth_m.min()) / span, CANNY_SIGMA, mode="nearest")
+    dy, dx = (ndimage.sobel(smooth, axis) for axis in (0, 1))
+    size = np.hypot(dx, dy)
+    # Across the edge, between the two neighbours on either side, the gradient is the largest.
+    rows, columns = np.indices(size.shape, dtype=np.float64)
+    unit = np.maximum(np.maximum(np.abs(dx), np.abs(dy)), 1e-12)
+    sides = ((rows + s * dy / unit, columns + s * dx / unit) for s in (-1.0, 1.0))
+    beside = [ndimage.map_coordinates(size, side, order=1, mode="nearest") for side in sides]
+    ridge = (size >= beside[0]) & (size > beside[1])
+    weak, strong = ridge & (size >= CANNY_LOW), ridge & (size >= CANNY_HIGH)
+    labels, _ = ndimage.label(weak, np.ones((3, 3)))
+    return weak & np.isin(labels, np.unique(labels[strong]))
+
+
+def boundary_errors(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) -> dict[str, float]:
+    """Distances between the boundaries of a map, whose holes take the nearest depth, and those of the truth.
+
+    Returns:
+        ``dbe_acc``: mean distance, pixels, of the map's boundaries from the truth's, of those nearer than 10;
+        ``dbe_comp``: mean of the distances both ways, at most 10 each. NaN where the truth has no boundary,
+        10 where the map has none.
+
+    Source: Koch et al., "Evaluation of CNN-based Single-Image Depth Estimation Methods" (iBims-1), S3.2.
+        Deviation: their true boundaries are drawn by hand, ours are found by the same filter.
+    """
+    known = np.isfinite(pred_m) & (pred_m > 0)
+    true = _canny(_filled(truth_m, valid)) & valid
+    if not known.any() or not true.any():
+        return {"dbe_acc": float("nan"), "dbe_comp": float("nan")}
+    drawn = _canny(_filled(pred_m, known)) & valid
+    to_true = ndimage.distance_transform_edt(~true)
+    near = drawn & (to_true < FARTHEST_PX)
+    if not near.any():
+        return {"dbe_acc": FARTHEST_PX, "dbe_comp": FARTHEST_PX}
+    both = np.concatenate([to_true[drawn], ndimage.distance_transform_edt(~drawn)[true]])
+    return {"dbe_acc": float(to_true[near].mean()), "dbe_comp": float(np.minimum(both, FARTHEST_PX).mean())}
+
+
+def _filled(depth_m: np.ndarray, known: np.ndarray) -> np.ndarray:
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return np.asarray(depth_m, np.float64)[tuple(nearest)]
+
+
+def depth_edges(depth_m: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """``(H, W)`` bool: pixels whose 3x3 neighbourhood is known and has a step of depth in it."""
+    log = np.log(np.where(valid, depth_m, 1.0))
+    high = ndimage.maximum_filter(np.where(valid, log, np.inf), 3)
+    low = ndimage.minimum_filter(np.where(valid, log, -np.inf), 3)
+    return np.isfinite(high) & np.isfinite(low) & (high - low > LOG_STEP)
+
+
+def edge_error(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) -> float:
+    """Mean relative error within 3 px of the edges of dense truth; NaN without an edge."""
+    near = ndimage.binary_dilation(depth_edges(truth_m, valid), iterations=NEAR_EDGE) & valid
+    return float((np.abs(pred_m - truth_m)[near] / truth_m[near]).mean()) if near.any() else float("nan")
+
+
+def surface_error(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) -> float:
+    """Mean absolute error of the slope of log depth, per mille a pixel, more than 5 px from any edge."""
+    off = valid & ~ndimage.binary_dilation(depth_edges(truth_m, valid), iterations=OFF_EDGE)
+    difference = np.log(np.maximum(pred_m, 1e-6)) - np.log(np.where(valid, truth_m, 1.0))
+    whole = off[1:, 1:] & off[:-1, 1:] & off[1:, :-1]
+    if not whole.any():
+        return float("nan")
+    slopes = [np.abs(np.diff(difference, axis=axis)) for axis in (0, 1)]
+    return float(500.0 * (slopes[0][:, 1:] + slopes[1][1:])[whole].mean())

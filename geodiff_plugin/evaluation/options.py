@@ -114,14 +114,6 @@ class _SampleOptions(EvalOptions):
     views: int = _count(2, "Views that methods take of a group that has more than two.", 2, 100)
     perturb: str | None = declare(None, "Wrong poses: turn, shift / baseline.", metavar="DEGREES,SHARE")
 
-    def changed(self, refs: Sequence[SampleRef]) -> list[SampleRef]:
-        """The references, with the poses given wrongly where ``perturb`` says so."""
-        from geodiff_plugin.evaluation.datasets.changed import changed_ref, perturbation
-
-        if self.perturb is None:
-            return list(refs)
-        return [changed_ref(ref, "perturbed", perturbation(self.perturb)) for ref in refs]
-
 
 @dataclass(frozen=True, kw_only=True)
 class PairsOptions(_SampleOptions):
@@ -320,12 +312,21 @@ def real_and_rendered(options: RealOptions, text: str) -> tuple[list[SampleRef],
     return real[: options.limit], rendered
 
 
-def select(refs: Sequence[SampleRef], options: PairsOptions | FigureOptions) -> list[SampleRef]:
-    """Keep the samples that ``scenes`` names, draw ``sample`` of them, keep the first ``limit``."""
-    kept, count = _kept(refs, data_of(options), options.scenes), getattr(options, "sample", None)
+def select(options: PairsOptions | FigureOptions, refs: Sequence[SampleRef] | None = None) -> list[SampleRef]:
+    """Of all samples or ``refs``: those that ``scenes`` names, ``sample`` drawn of them, the first ``limit``.
+
+    Their poses are given wrongly where ``perturb`` says so.
+    """
+    from geodiff_plugin.evaluation.datasets.sample import changed_ref, two_numbers
+
+    kept = _kept(all_refs(options) if refs is None else refs, data_of(options), options.scenes)
+    count = getattr(options, "sample", None)
     if count is not None:
         if count > len(kept):
             bad_value("--sample", f"at most {len(kept)}, the number of samples found", count)
         drawn = random.Random(options.seed).sample(range(len(kept)), count)
         kept = [kept[i] for i in sorted(drawn)]
-    return kept[: options.limit]
+    kept = kept[: options.limit]
+    if options.perturb is None:
+        return kept
+    return [changed_ref(ref, "perturbed", two_numbers(options.perturb, "--perturb")) for ref in kept]

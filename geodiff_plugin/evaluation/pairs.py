@@ -20,17 +20,16 @@ from geodiff_plugin.evaluation import experiment, tables
 from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.evaluation.datasets import SampleRef
 from geodiff_plugin.evaluation.experiment import Page
-from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
+from geodiff_plugin.evaluation.options import PairsOptions, select
 from geodiff_plugin.evaluation.tables import Table, cell, count_of_pairs, mean_cell, pairs_of
 from geodiff_plugin.priors import PRIORS, find_prior
 from geodiff_plugin.runner import Item, Record, this_process
 
 
 def pair_cells(refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions) -> list[Item]:
-    """Cells of methods, on samples changed and scored as the options say."""
-    names, refs, crop = tuple(dict.fromkeys(methods)), options.changed(refs), options.crop
-    settings, out = options.settings, options.out
-    return experiment.method_cells(refs, names, settings, out, crop=crop, save_depth=options.save_depth)
+    """Cells of methods on samples, scored as the options say."""
+    names, how = tuple(dict.fromkeys(methods)), {"crop": options.crop, "save_depth": options.save_depth}
+    return experiment.method_cells(refs, names, options.settings, options.out, **how)
 
 
 def compare(
@@ -75,7 +74,7 @@ def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
 
 def run_pairs(name: str, options: PairsOptions) -> Page | None:
     """Measure methods on pairs and write the tables; errors as ``run_experiment``."""
-    refs, count, more = select(all_refs(options), options), this_process().count, []
+    refs, count, more = select(options), this_process().count, []
     if options.sample is not None:
         more.append(f"Drawn with seed {options.seed}: {', '.join(ref.label for ref in refs)}.")
     if count > 1:
@@ -184,7 +183,7 @@ def run_changes(name: str, options: PairsOptions) -> Page | None:
 
     ``options.methods`` are run beside the table's own; errors as ``run_experiment``.
     """
-    flat, refs = name == "flatness", select(all_refs(options), options)
+    flat, refs = name == "flatness", select(options)
     methods = FLATNESS if flat else tuple(method for _, method in CHANGES[name])
 
     def page_tables(records: list[Record]) -> list[Table]:
@@ -246,7 +245,7 @@ def run_cost(name: str, options: PairsOptions) -> Page:
     """Measure ``COST_METHODS`` and further ones, and write the table; records go to ``out/cost``."""
     if this_process().count > 1:
         bad_value("the number of processes", "1 for cost", this_process().count)
-    refs = select(all_refs(options), options)
+    refs = select(options)
     records, taken = list[Record](), dict[str, int | None]()
     alone = replace(options, out=options.out / "cost")
     for method in dict.fromkeys((*COST_METHODS, *options.methods)):

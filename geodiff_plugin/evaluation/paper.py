@@ -205,7 +205,7 @@ def _find(column: Column, options: PairsOptions, draw: bool) -> tuple[Column, li
         refs = [ref for ref in refs if not options.scenes or any(s in ref.label for s in options.scenes)]
         if refs:
             drawn = column.full_count if draw and column.full_count <= len(refs) else None
-            chosen = select(refs, replace(options, sample=options.sample or drawn))
+            chosen = select(replace(options, sample=options.sample or drawn), refs)
             return column._replace(dataset=dataset), chosen
     return column, []
 

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.capture.agreement import DepthFrame, seen_in
-from geodiff_plugin.evaluation import edges, metrics
+from geodiff_plugin.evaluation import metrics
 from geodiff_plugin.evaluation.baselines.base import Prediction
 from geodiff_plugin.evaluation.baselines.unguided import sweep
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, depth_to_disparity
@@ -97,10 +97,10 @@ def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, Sco
     pred_px = depth_to_disparity(_positive(depth_m), *cameras)
     masks, hidden = {"all": valid}, sample.occluded
     if hidden is None and valid.mean() > DENSE:
-        hidden = edges.hidden_by_truth(true_px, valid)
+        hidden = metrics.hidden_by_truth(true_px, valid)
     if hidden is not None:
         masks["visible"] = valid & ~hidden & ~out_of_view(sample)
-    edge = edges.near_disparity_steps(true_px, valid)
+    edge = metrics.near_disparity_steps(true_px, valid)
     masks |= {"edge": edge, "flat": valid & ~edge}
     step_px = float(sample.notes.get("disparity_step_px", 0.0))
     return {
@@ -129,8 +129,8 @@ def _metric_scores(sample: StereoSample, prediction: Prediction, kept: np.ndarra
         areas = {name: metrics.ause(depth_m, truth, kept, order) for name, order in orders.items()}
         record["ause_confidence"] = _plain(areas)
     if valid.mean() > DENSE:
-        f1 = {"f1": edges.boundary_f1(depth_m, truth, valid)}
-        record["boundaries"] = _plain(f1 | edges.boundary_errors(depth_m, truth, valid))
+        f1 = {"f1": metrics.boundary_f1(depth_m, truth, valid)}
+        record["boundaries"] = _plain(f1 | metrics.boundary_errors(depth_m, truth, valid))
     return record
 
 

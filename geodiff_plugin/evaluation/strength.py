@@ -28,10 +28,9 @@ from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.evaluation import tables
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, find_pairs, load
-from geodiff_plugin.evaluation.edges import edge_error, surface_error
 from geodiff_plugin.evaluation.experiment import Page, cell_key, run_experiment
 from geodiff_plugin.evaluation.figures import draw_strength, shaded
-from geodiff_plugin.evaluation.metrics import evaluate_depth, to_space
+from geodiff_plugin.evaluation.metrics import edge_error, evaluate_depth, surface_error, to_space
 from geodiff_plugin.evaluation.options import STRENGTHS, StrengthOptions, data_of
 from geodiff_plugin.evaluation.scoring import DENSE, in_metres
 from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, method_title, most_of

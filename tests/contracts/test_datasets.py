@@ -14,9 +14,8 @@ from PIL import Image
 
 from geodiff_plugin.evaluation.baselines import Prediction
 from geodiff_plugin.evaluation.datasets import DATASETS, StereoSample, find_pairs, load, load_pairs
-from geodiff_plugin.evaluation.datasets.changed import changed_ref
 from geodiff_plugin.evaluation.datasets.layouts import KEY_VIEWS, find_mvsnet, find_robustmvd
-from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
+from geodiff_plugin.evaluation.datasets.sample import changed_ref, depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.experiment import cell_key
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import as_image_01, write_pfm

@@ -18,7 +18,7 @@ from geodiff_plugin.evaluation import experiment
 from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS
 from geodiff_plugin.evaluation.calibrations import run_poses
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs, load
-from geodiff_plugin.evaluation.datasets.changed import changed_ref
+from geodiff_plugin.evaluation.datasets.sample import changed_ref
 from geodiff_plugin.evaluation.options import COMMANDS, DirOptions, PosesOptions, command_line
 from tests.evaluating import SHIFT, SIZE, invoke, write_scenes
 

@@ -7,24 +7,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from geodiff_plugin.evaluation.edges import (
-    boundary_errors,
-    boundary_f1,
-    edge_error,
-    hidden_by_truth,
-    near_disparity_steps,
-    surface_error,
-)
 from geodiff_plugin.evaluation.metrics import (
     FLOOR_M,
     MIN_DISPARITY,
     align,
     ause,
+    boundary_errors,
+    boundary_f1,
     confidence_deciles,
     counted,
     crop_mask,
+    edge_error,
     evaluate_depth,
     evaluate_disparity,
+    hidden_by_truth,
+    near_disparity_steps,
+    surface_error,
 )
 
 NAN = float("nan")

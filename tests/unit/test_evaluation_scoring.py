@@ -7,7 +7,7 @@ from geodiff_plugin.evaluation import experiment, scoring
 from geodiff_plugin.evaluation.baselines import Prediction
 from geodiff_plugin.evaluation.baselines.unguided import sweep
 from geodiff_plugin.evaluation.datasets import StereoSample
-from geodiff_plugin.evaluation.datasets.changed import with_perturbed_poses
+from geodiff_plugin.evaluation.datasets.sample import with_perturbed_poses
 from geodiff_plugin.evaluation.scoring import matched, out_of_view, regions, score
 from geodiff_plugin.evaluation.tables import details_tables, headline
 

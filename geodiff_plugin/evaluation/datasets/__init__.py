@@ -7,9 +7,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.datasets.changed import CHANGES
 from geodiff_plugin.evaluation.datasets.layouts import LAYOUTS
-from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample
+from geodiff_plugin.evaluation.datasets.sample import CHANGES, Dataset, SampleRef, StereoSample
 
 __all__ = ["DATASETS", "Dataset", "SampleRef", "StereoSample", "find_pairs", "load", "load_pairs"]
 

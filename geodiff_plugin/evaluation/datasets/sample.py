@@ -1,15 +1,21 @@
-"""The sample that every data set yields, its reference, and what readers of data sets share."""
+"""The sample that every data set yields, its reference, what readers share, samples changed on purpose."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import re
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._camera_checks import check_metres
 from geodiff_plugin._checks import bad_value
@@ -104,7 +110,7 @@ class Dataset:
         cap_m: farthest truth that counts in the set's own protocol, metres; ``None`` for no limit.
         obtain: how to get the set, one sentence with its address and licence.
         options: keywords that ``find`` takes beside the folder.
-        needs_folder: whether there is a folder to look into; not for what is rendered.
+        needs_folder: whether there is a folder to look into.
     """
 
     name: str
@@ -168,12 +174,11 @@ def check_size(path: Path, got: tuple[int, ...], expected: tuple[int, ...], side
 
 def folders(root: Path, depth: int) -> list[Path]:
     """``root`` and the folders below it down to ``depth`` levels, sorted."""
-    level = [root] if os.path.isdir(root) else []
-    listed = level
+    levels = [[root] if os.path.isdir(root) else []]
     for _ in range(depth):
-        level = [child for parent in level for child in sorted(parent.iterdir()) if child.is_dir()]
-        listed = listed + level
-    return listed
+        below = chain.from_iterable(sorted(parent.iterdir()) for parent in levels[-1])
+        levels.append([path for path in below if path.is_dir()])
+    return list(chain(*levels))
 
 
 def make_sample(
@@ -181,13 +186,9 @@ def make_sample(
 ) -> StereoSample:
     """The sample of a reference, once its files are read.
 
-    Args:
-        ref: names the sample.
-        images: left and right, ``(H, W, 3)`` uint8 each.
-        rig: of the images as they are handed over.
-        depth_m: ``(H, W)`` float, metres; what is not a positive number is unknown.
-        notes: as in ``StereoSample``.
-        **masks: ``occluded``, ``material`` and ``extra_views`` of ``StereoSample``.
+    ``images`` are ``(H, W, 3)`` uint8 each, left and right; ``rig`` is that of the images as handed over;
+    ``depth_m`` is ``(H, W)`` metres, unknown where not a positive number; ``masks`` are ``occluded``,
+    ``material`` and ``extra_views`` of ``StereoSample``.
     """
     valid = np.isfinite(depth_m) & (depth_m > 0)
     cameras = (torch.as_tensor(matrix) for matrix in (rig.K_left, rig.K_right, rig.T_right_from_left))
@@ -199,3 +200,107 @@ def make_sample(
         notes=notes,
         **masks,
     )
+
+
+#: Errors are drawn between this share of the asked ones and all of them.
+LEAST = 0.3
+
+Numbers = tuple[float, float]
+
+
+def changed_ref(ref: SampleRef, kind: str, change: Numbers) -> SampleRef:
+    """The reference to a sample with a change, a key of ``CHANGES``, by whose two numbers it is named."""
+    name = f"{ref.name}-{CHANGES[kind][0].format(*change)}"
+    return replace(ref, name=name, files={**ref.files, kind: change})
+
+
+#: Option -> what is typed, with its two largest numbers, and an example.
+_ASKED: dict[str, tuple[str, Numbers, str]] = {
+    "--perturb": (
+        *("DEGREES,SHARE", (30, 0.9)),
+        "1.5,0.1 turns by up to 1.5 degrees and shifts by up to a tenth of the baseline.",
+    ),
+    "--drift": (
+        *("DEGREES,PIXELS", (5, 20)),
+        "0.3,1.5 turns the right camera by 0.3 degrees and moves its image by 1.5 pixels.",
+    ),
+}
+
+
+def two_numbers(text: str, option: str) -> Numbers:
+    """The two numbers of ``--perturb`` or ``--drift`` as typed, each from 0 on; else ``ValueError``."""
+    names, most, cure = _ASKED[option]
+    parts = re.fullmatch(r"\s*(\d*\.?\d+)\s*,\s*(\d*\.?\d+)\s*", text)
+    first, second = map(float, parts.groups()) if parts else (-1.0, -1.0)
+    if not (0 <= first <= most[0] and 0 <= second <= most[1]):
+        bad_value(option, f"{names} with numbers in [0, {most[0]:g}] and [0, {most[1]:g}]", repr(text), cure)
+    return first, second
+
+
+def with_exposure(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
+    """Change the right view only: v in [0, 1] becomes ``gain * v ** gamma``, clipped, in 8 bits again."""
+    gain, gamma = change
+    right_01 = np.clip(gain * (sample.right / 255.0) ** gamma, 0.0, 1.0)
+    return replace(sample, name=name, right=np.rint(255 * right_01).astype(np.uint8))
+
+
+def with_drifted_rig(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
+    """What a rig gives whose right camera has turned since it was calibrated, and whose image has moved.
+
+    Both are a homography of the right image, whatever the depth: calibration and truth stay. ``change`` is
+    degrees, about an axis that is drawn from the name, and pixels up or down, likewise.
+    """
+    degrees, px = change
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    axis = rng.normal(size=3)
+    R = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix()
+    moved = np.eye(3)
+    moved[1, 2] = px * rng.choice((-1.0, 1.0))
+    H = moved @ sample.K_right @ R @ np.linalg.inv(sample.K_right)
+    size = sample.right.shape[1::-1]
+    right = cv2.warpPerspective(sample.right, H, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return replace(sample, name=name, right=right)
+
+
+def perturbed_pose(
+    E: np.ndarray, degrees: float, share: float, depth_m: float, rng: np.random.Generator
+) -> np.ndarray:
+    """A pose with an error, whose baseline is as long as before: the length is what no photograph tells.
+
+    The turn is at most ``degrees``, the shift that ``share`` of the baseline. Every second error is of a
+    tracker's kind, whose shift makes up for its turn at the scene's depth as far as it may; the others' shift
+    goes anywhere.
+    """
+    axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    turn = axis * np.radians(degrees) * rng.uniform(LEAST, 1.0)
+    baseline = float(np.linalg.norm(E[:3, 3]))
+    shift = way * share * baseline * rng.uniform(LEAST, 1.0)
+    if rng.random() < 0.5:
+        shift = -np.cross(turn, (0.0, 0.0, depth_m))
+        shift *= min(1.0, share * baseline / max(float(np.linalg.norm(shift)), 1e-12))
+    wrong = E.copy()
+    wrong[:3, :3] = E[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
+    moved = E[:3, 3] + E[:3, :3] @ shift
+    wrong[:3, 3] = moved * baseline / np.linalg.norm(moved)
+    return wrong
+
+
+def with_perturbed_poses(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
+    """Give the poses of a sample's right views wrongly, by at most so many degrees and share of the baseline.
+
+    The truth says how far away the scene is; the error is drawn from the name.
+    """
+    sample.check_truth()
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    depth_m, (degrees, share) = float(np.median(sample.depth_m[sample.valid])), change
+    wrong = partial(perturbed_pose, degrees=degrees, share=share, depth_m=depth_m, rng=rng)
+    E, extra = wrong(sample.E), tuple((image, K, wrong(other)) for image, K, other in sample.extra_views)
+    return replace(sample, name=name, E=E, E_true=sample.E_scored, extra_views=extra)
+
+
+#: Entry of ``SampleRef.files`` -> what it adds to the name, and how a sample becomes so.
+CHANGES: dict[str, tuple[str, Callable[[StereoSample, Any, str], StereoSample]]] = {
+    "right_exposure": ("gain{:g}-gamma{:g}", with_exposure),
+    "perturbed": ("turn{:g}-shift{:g}", with_perturbed_poses),
+    "drifted": ("drift{:g}-{:g}px", with_drifted_rig),
+}
