@@ -1,7 +1,5 @@
 """Fixtures: a tiny random Marigold, and a pair of analytic renderings of a tilted, textured plane."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import dataclass

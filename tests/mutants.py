@@ -8,8 +8,6 @@ Printed are the mutants that survive, and those whose text is no longer there. W
 files whose path contains one of them run.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 import shutil

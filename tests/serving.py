@@ -1,7 +1,5 @@
 """A program that serves a page, for the length of a test, and files for a visitor of it."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

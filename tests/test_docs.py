@@ -1,7 +1,5 @@
 """What the documentation shows runs, and what it names exists."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """Every block of docs/how-to/extending.md runs, and what it adds to the tables works."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from types import FunctionType

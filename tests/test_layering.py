@@ -1,7 +1,5 @@
 """A lower layer never imports a higher one, and nothing imports itself in a circle."""
 
-from __future__ import annotations
-
 import ast
 import graphlib
 from pathlib import Path

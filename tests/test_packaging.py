@@ -1,7 +1,5 @@
 """What a user of the wheel gets: light imports, the prior, the pair, types; no tools of the maintainers."""
 
-from __future__ import annotations
-
 import ast
 import os
 import shutil

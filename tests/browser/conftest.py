@@ -1,7 +1,5 @@
 """A served page and a headless Chromium; without either the tests are skipped with the reason."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from pathlib import Path

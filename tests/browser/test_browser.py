@@ -3,8 +3,6 @@
 ``GEODIFF_SCREENSHOT=docs/images/app.png pytest tests/browser`` also makes the picture of the docs.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Run the command line inside the test's process, and write a small pair for it to read."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ That table has a command, in a folder with the files below, and indented what it
 changed on purpose: ``GEODIFF_WRITE=1 pytest tests/cli/test_bad_input.py``, and read what differs.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -139,11 +137,6 @@ def test_bad_input(typed, geodiff, pair_files, monkeypatch):
         MESSAGES[typed] = message
         TABLE.write_text("".join(f"{words}\n    {said}\n" for words, said in MESSAGES.items()), "utf-8")
     assert message == MESSAGES[typed]
-
-
-def test_what_the_option_parser_refuses_has_the_same_exit_code(geodiff, pair_files):
-    for words in ([*pair_files.command, "--stepps", 3], [*pair_files.command, "--steps", "many"], ["dept"]):
-        assert geodiff(*words).code == 2
 
 
 def test_what_needs_no_torch_is_said_without_it(pair_files):

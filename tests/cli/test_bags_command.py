@@ -1,7 +1,5 @@
 """``geodiff depth`` on a bag, resumed, and ``geodiff submit``, read back by others' code."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

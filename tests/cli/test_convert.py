@@ -1,7 +1,5 @@
 """``geodiff convert``: every checkpoint format to a folder that loads, and clear refusals."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -14,7 +12,6 @@ from safetensors.torch import load_file, save_file
 from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
 from geodiff_plugin.cli.convert import run_convert
-from geodiff_plugin.cli.converters.depthfm import unet_config
 from geodiff_plugin.cli.converters.marigold_v2 import merged, read_prompt
 from geodiff_plugin.priors import find_prior, load_prior
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
@@ -80,16 +77,6 @@ def test_a_checkpoint_of_depthfm_loads(convert, checkpoint, tmp_path):
     pipe = found.load()
     assert pipe.config.noising_step == 400 and pipe.config.prediction_type == "log"
     assert torch.equal(pipe.unet.conv_in.weight, checkpoint["state_dict"]["input_blocks.0.0.weight"])
-
-
-def test_options_of_the_published_depthfm():
-    """As ``depthfm-v1.ckpt`` holds them: the U-Net of Stable Diffusion 2 with 8 heads."""
-    theirs = {"model_channels": 320, "attention_resolutions": [4, 2, 1], "channel_mult": [1, 2, 4, 4]}
-    hparams = HPARAMS | theirs | {"num_heads": 8, "context_dim": 1024}
-    config = unet_config(hparams)
-    assert config["block_out_channels"] == (320, 640, 1280, 1280) and config["attention_head_dim"] == 8
-    assert config["down_block_types"] == ("CrossAttnDownBlock2D",) * 3 + ("DownBlock2D",)
-    assert config["up_block_types"] == ("UpBlock2D",) + ("CrossAttnUpBlock2D",) * 3
 
 
 class Foreign:
@@ -260,14 +247,6 @@ def test_a_merged_v2_loads_and_keeps_files_and_index(convert_v2, assets):
     low, factors = torch.ones(1, 2), {"a A": torch.ones(1, 2), "a B": torch.full((2, 1), 3.0)}
     assert torch.equal(merged("a", torch.zeros(2, 2), {"a": torch.ones(2, 2)}), torch.ones(2, 2))
     assert torch.equal(merged("a", low.expand(2, 2), factors), torch.full((2, 2), 4.0))
-
-
-def test_the_folders_name_or_an_option_tells_the_space(convert_v2, assets):
-    (assets / "V2/depth/Log-stage2").rename(assets / "V2/depth/mine")
-    file = "V2/depth/mine/trainables.safetensors"
-    refused(convert_v2(checkpoint=file), assets, KEPT, "'mine'", "--space")
-    assert convert_v2("--space", "disparity", checkpoint=file).code == 0
-    assert load_prior(assets / "out").config.prediction_type == "disparity"
 
 
 def test_what_is_missing_or_does_not_fit_v2_is_named(convert_v2, assets):

@@ -1,7 +1,5 @@
 """``geodiff depth`` end to end on tiny random priors: files, report, silence, Ctrl-C; info and demo."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -39,13 +37,6 @@ def lidar(pair_files):
         return known
 
     return write
-
-
-def test_known_points_move_the_depth(geodiff, command, lidar):
-    known = lidar(2.5)
-    assert geodiff(*command, "--steps", 1, "--points", "lidar.npy", "-q").code == 0
-    depth_m = np.load("geodiff-out/depth.npy")
-    assert np.median(np.abs(depth_m[known > 0] / 2.5 - 1)) < 0.1
 
 
 def test_points_without_a_right_image_and_a_cloud_of_what_is_believed(geodiff, command, lidar):
@@ -136,21 +127,6 @@ def test_seeds_presets_and_range(geodiff, command):
     assert guidance["gradient"] == "denoised" and guidance["depth_range"] == [1.0, 5.0]
 
 
-def test_images_of_different_kind_and_size(geodiff, command, pair_files, textured_plane):
-    """A grey 16-bit left image and a right one of twice the size with a K of its own."""
-    grey = textured_plane.left.mean(-1) / 255 * 65535
-    Image.fromarray(grey.astype(np.uint16)).save(pair_files.left)
-    Image.open(pair_files.right).resize((128, 96)).save(pair_files.right)
-    K_right = textured_plane.K.copy()
-    K_right[:2, :2] *= 2
-    K_right[:2, 2] = K_right[:2, 2] * 2 + 0.5
-    for name, matrix in (("K", textured_plane.K), ("Kr", K_right), ("E", textured_plane.E)):
-        np.savetxt(f"{name}.txt", matrix)
-    cameras = "--K K.txt --K-right Kr.txt --E E.txt".split()
-    answer = geodiff(*pair_files.images, *cameras, *command[5:], *QUICK, "-q", "--json")
-    assert answer.code == 0 and json.loads(answer.out)["inputs"]["right_size"] == [128, 96], answer.err
-
-
 def test_the_right_cameras_centre(geodiff, command, pair_files):
     """Assumed where it is not given, and said; with it depth is of another disparity."""
     numbers = "--fx 60 --fy 60 --cx 31.5 --cy 23.5 --baseline 0.12".split()
@@ -161,21 +137,6 @@ def test_the_right_cameras_centre(geodiff, command, pair_files):
     assert answer.code == 0 and "assumed" not in answer.err
     assert report_of("other")["inputs"]["K_right"][0][2] == 33.5
     assert report_of("same")["assumed"] and not report_of("other")["assumed"]
-
-
-@pytest.mark.parametrize("error", [RuntimeError, OSError])
-def test_failing_call_writes_nothing(geodiff, command, pair_files, monkeypatch, error):
-    def broken(*_):
-        raise error("in the middle")
-
-    monkeypatch.setattr("geodiff_plugin.cli.depth.write_maps", broken)
-    before = names_in(pair_files.folder)
-    if error is OSError:  # a full disk, say
-        assert "geodiff-out could not be written (in the middle)" in geodiff(*command, "-q", *QUICK).err
-    else:
-        with pytest.raises(error, match="in the middle"):
-            geodiff(*command, "-q", *QUICK)
-    assert names_in(pair_files.folder) == before
 
 
 def test_interrupt_of_a_running_process(command, pair_files):
@@ -253,13 +214,6 @@ def test_geowizard_with_its_option(geodiff, saved, command):
     assert normals.shape == (*np.load("out/depth.npy").shape, 3)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-3)
     assert "normals.npy" in report_of("out")["files"]["names"]
-
-
-def test_a_deterministic_prior_says_so(geodiff, saved, command):
-    prior = ["--prior", saved("e2e-ft"), "--ensemble", "3", "--resolution", "32", "--space", "disparity"]
-    answer = geodiff(*command[:5], *prior, "--out", "out")
-    assert answer.code == 0 and "warning: This prior gives the same map every time" in answer.err
-    assert not Path("out/uncertainty.npy").exists()
 
 
 @pytest.mark.parametrize(

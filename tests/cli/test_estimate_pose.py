@@ -1,7 +1,5 @@
 """``geodiff depth --estimate-pose`` on a pair as from a phone; what goes through a lens on its way there."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -142,11 +140,6 @@ def test_every_photograph_has_its_lens():
         assert told(**given) == expected, given
     with pytest.raises(InputError, match="--view-distortion must be given for each"):
         told(own=own, view=view, view_k=view)
-
-
-def test_rectified_images_have_no_lens():
-    rig = Rig(np.eye(3), np.eye(3), np.eye(4), source="calib.txt", rectified=True)
-    assert lenses_of(DepthOptions(**VIEWS, distortion=("0,0,0,0",)), rig) == (None, None), "as the file says"
 
 
 FOUR = {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}

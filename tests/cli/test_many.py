@@ -1,9 +1,6 @@
 """Many pairs in one run: folders, lists and videos; overlap, resumption, failures, several processes."""
 
-from __future__ import annotations
-
 import csv
-import errno
 import json
 import os
 import shutil
@@ -119,16 +116,6 @@ def test_two_folders_give_what_single_runs_give(geodiff, finished):
     assert sorted(os.listdir("out/b")) == sorted(os.listdir("one"))
 
 
-def test_warnings_are_those_of_every_pair_and_said_once(geodiff, fresh):
-    text = (fresh / "calib.txt").read_text().splitlines()
-    text[1] = text[1].replace(" 0 ", " 0 1", 1)  # cam1 contradicts doffs
-    (fresh / "calib.txt").write_text("\n".join(text))
-    answer = geodiff(*COMMAND)
-    assert answer.code == 0 and answer.err.count("for the right image") == 1, answer.err
-    assert "3 pairs: 3 done, 0 there already, 0 failed" in answer.out and "3/3" in answer.err
-    assert all("for the right image" in report_of(f"out/{name}")["warnings"][0] for name in "abc")
-
-
 def test_finished_pairs_are_skipped_and_overwrite_does_them_anew(geodiff, finished):
     made = [path.stat().st_mtime_ns for path in DEPTHS]
     for path in (finished / "out" / "b").iterdir():
@@ -220,23 +207,6 @@ def test_a_list_with_a_calibration_each_and_maps_of_another_model(geodiff, fresh
     np.save("maps/b.npy", np.add.outer(np.ones(24), np.arange(32.0)))
     answer = geodiff(*words)  # a map that changed is another input
     assert answer.code == 2 and "b.npy changed" in answer.err
-
-
-def test_a_prior_that_does_not_load_ends_the_run(geodiff, fresh):
-    (fresh / "prior" / "model_index.json").write_text("{}")
-    answer = geodiff(*COMMAND)
-    assert answer.code == 2 and answer.err.count("geodiff: ") == 1, answer.err
-
-
-def test_a_table_that_cannot_be_written_in_the_end_is_shown(geodiff, finished, monkeypatch):
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(many, "atomic_path", full)
-    answer = geodiff(*COMMAND)
-    assert answer.code == 0 and "3 pairs: 0 done, 3 there already" in answer.out
-    told = f"geodiff: {Path('out', 'pairs.csv')} could not be written (No space left on device)."
-    assert answer.err.splitlines()[-1] == told
 
 
 def test_a_full_disk_ends_the_run_and_keeps_what_is_finished(geodiff, fresh, monkeypatch):

@@ -1,12 +1,9 @@
 """Messages of the commands: what counts as bad input, warnings, and the summary."""
 
-from __future__ import annotations
-
 import io
 import os
 import re
 import sys
-import warnings
 from collections import Counter
 from pathlib import Path
 
@@ -18,7 +15,6 @@ from geodiff_plugin import _checks
 from geodiff_plugin._checks import InputError, bad_type, bad_value
 from geodiff_plugin.cli.app import main
 from geodiff_plugin.cli.report import depth_summary, summary_line
-from geodiff_plugin.cli.terminal import collected_warnings
 from geodiff_plugin.formats import read_image
 from tests.cli.conftest import stop
 
@@ -74,16 +70,6 @@ def test_warnings_are_sentences(monkeypatch, geodiff, pair_files):
         assert line.startswith("warning: ") and all(word in line for word in told)
 
 
-def test_a_focal_length_that_the_exif_contradicts(monkeypatch, geodiff, pair_files):
-    monkeypatch.setattr("geodiff_plugin.cli.depth.load_guided_prior", stop)
-    exif = Image.Exif()
-    exif[0x0112] = 1
-    exif.get_ifd(0x8769)[0xA405] = 65  # 120 px for 64x48
-    Image.open(pair_files.left).save(pair_files.left, exif=exif)
-    lines = geodiff(*pair_files.command).err.splitlines()
-    assert lines[0].startswith("warning: K has a focal length of 60 px for LEFT, 0.50 times the 120 px")
-
-
 def test_names_beyond_the_terminals_encoding(monkeypatch, tmp_path):
     """As on Windows, or into a file there: the answer says them in escapes, after the work as before."""
     np.save(tmp_path / "depth.npy", np.ones((40, 48), np.float32))
@@ -100,11 +86,6 @@ def test_names_beyond_the_terminals_encoding(monkeypatch, tmp_path):
     for stream, words in ((narrow["stdout"], rb"gr\xf6\xdfe.webp"), (narrow["stderr"], rb"gr\xf6\xdfe.npy")):
         stream.flush()
         assert words in stream.buffer.getvalue()
-
-
-def test_other_packages_warn_as_ever():
-    with pytest.warns(UserWarning, match="of another package"), collected_warnings(pytest.fail):
-        warnings.warn("of another package", stacklevel=1)
 
 
 def test_summary():

@@ -1,7 +1,5 @@
 """``--out`` is tried before the work, held during it, and no finished result is lost."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

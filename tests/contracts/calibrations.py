@@ -1,7 +1,5 @@
 """Calibrations of any rig in every format, by the conventions of the tools that write them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -326,25 +326,6 @@ def test_robustmvd_takes_key_views_and_belongs_to_no_other_set(tmp_path):
     assert find_pairs(tmp_path) == []
 
 
-@pytest.mark.parametrize(
-    ("depth", "left", "right"),
-    [("depth.pfm", "left.JPG", "right.jpeg"), ("depth.png", "left.tif", "right.webp")],
-)
-def test_folder_takes_depth_and_images_of_any_format_and_a_png_before_its_copies(
-    tmp_path, depth, left, right
-):
-    calibration = LAYOUTS["folder"]["mine/calib.txt"]
-    truth = with_hole(DEPTH_M, np.inf)
-    if depth == "depth.png":
-        truth = np.rint(1000 * with_hole(DEPTH_M, 0)).astype(np.uint16)
-    files = {depth: truth, left: LEFT, right: RIGHT, "calib.txt": calibration, "left.txt": "notes"}
-    write(tmp_path / "mine", files)
-    np.testing.assert_allclose(sample_of(tmp_path, "folder").depth_m, with_hole(DEPTH_M, 0), atol=5.1e-4)
-    write(tmp_path / "mine", {"left.png": picture(HEIGHT, WIDTH - 2)})
-    with pytest.raises(ValueError, match=f"{depth} must be for 62 x 40 pixels as the left image"):
-        sample_of(tmp_path, "folder")
-
-
 @pytest.mark.parametrize("missing", ["left.png", "right.png", "calib.txt"])
 def test_a_folder_of_two_of_three_is_no_silent_gap_and_one_of_less_is_no_pair(tmp_path, missing):
     write(tmp_path, LAYOUTS["folder"])

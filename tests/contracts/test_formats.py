@@ -1,7 +1,5 @@
 """Every entry of CALIBRATION_FORMATS: any rig is read as it was written, and bad files get a sentence."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -205,29 +203,6 @@ def test_a_wrong_entry_is_named(tmp_path, sample, old, new, said):
 def test_a_wrong_choice_is_named(tmp_path, sample, given_, said):
     with pytest.raises(InputError, match=said):
         of.read_texts(tmp_path, *SAMPLES[sample], **(choice(sample) | given_))
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "error", "said"),
-    [
-        (
-            "nope.txt",
-            None,
-            FileNotFoundError,
-            "be a calibration file; got .*nope.txt, which does",
-        ),
-        ("", None, IsADirectoryError, "got the folder"),
-        ("empty", b"", InputError, "empty"),
-        ("blank", b" \n\n", InputError, "blanks"),
-        ("binary", b"\x89PNG\0\0\0", InputError, "binary"),
-        ("other", b"hi: you\n", InputError, r"known format \(Middlebury.*MVSNet.*which is none of.*fx, fy"),
-    ],
-)
-def test_what_is_no_calibration_is_refused(tmp_path, name, content, error, said):
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
-    with pytest.raises(error, match=said):
-        read_calibration(tmp_path / name)
 
 
 def test_how_many_files_a_format_needs(tmp_path):

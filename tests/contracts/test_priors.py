@@ -1,7 +1,5 @@
 """What every prior of the table must do, on tiny random pipelines."""
 
-from __future__ import annotations
-
 import copy
 import json
 from contextlib import contextmanager, nullcontext

@@ -3,8 +3,6 @@
 Weights are drawn by a seed, images processed at 64 pixels; every function makes a new pipeline.
 """
 
-from __future__ import annotations
-
 import string
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Tiny random depth models of ``transformers``, each with its preparation of images."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

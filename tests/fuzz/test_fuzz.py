@@ -1,7 +1,5 @@
 """No file and no argument, however damaged, ends in a traceback."""
 
-from __future__ import annotations
-
 import io
 import os
 import signal

@@ -3,8 +3,6 @@
 They use public names only, so that a change of the structure needs no change here.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

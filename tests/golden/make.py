@@ -9,8 +9,6 @@ change of the structure moves no bit, freeze a FILE before the change, run the s
 what it prints. Nothing can be recovered from either of the pictures.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

@@ -5,8 +5,6 @@ kept of an array is coarse (mean, spread, three quantiles), so that it is the sa
 few thousandths; a constant of a part that changes by a few per cent shows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

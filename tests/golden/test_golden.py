@@ -1,7 +1,5 @@
 """Results that no change of the structure may move (``make.py`` freezes them anew)."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

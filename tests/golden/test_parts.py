@@ -1,7 +1,5 @@
 """Numbers of the method's parts, stored (``make.py --parts`` makes them anew)."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

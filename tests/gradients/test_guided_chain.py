@@ -1,7 +1,5 @@
 """Finite differences through the whole chain: z_t, U-Net, z0_hat, decoder, metres, warp, L_geo."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The ComfyUI nodes, imported beside a stub of the host and run along the workflow that ships with them."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import sys

@@ -1,13 +1,11 @@
 """What a corrected step decodes and encodes, and that any other is the prior's own."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from tests.integration.test_tiny_decoder import Counted
+from tests.integration.test_tiny_decoder import counted
 
 
 def guided(pipe, pair, steps=5, **knobs):
@@ -24,12 +22,12 @@ def test_a_step_that_is_not_corrected_is_the_priors_own(
     make_pipeline, textured_plane, monkeypatch, corrections
 ):
     pipe = make_pipeline()
-    counted = Counted(pipe.vae, monkeypatch)
+    calls = counted(pipe.vae, monkeypatch)
     found = guided(pipe, textured_plane, corrections=corrections)
     looked = [report.step for report in found.history]
     assert looked == {1: [4], 3: [2, 3, 4]}[corrections]
     # A correction decodes once and encodes twice, the last one not at all; the stock call encodes the image.
-    assert (counted.decoded, counted.encoded) == (len(looked), 1 + 2 * (corrections - 1))
+    assert calls == {"decode": len(looked), "encode": 1 + 2 * (corrections - 1)}
 
 
 def test_the_result_does_not_depend_on_whether_the_latent_is_asked_for(make_pipeline, textured_plane):

@@ -1,7 +1,5 @@
 """A map of another model as the prior: the second view makes it metric. On the bundled pair."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

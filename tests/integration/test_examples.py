@@ -1,7 +1,5 @@
 """Every example runs as it stands, on a tiny random prior to be quick."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The guided call end to end on tiny random pipelines: what it changes, and what it leaves alone."""
 
-from __future__ import annotations
-
 import gc
 import json
 import weakref

@@ -1,7 +1,5 @@
 """Guided calls of a prior in float16, and in float64."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

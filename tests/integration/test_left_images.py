@@ -1,7 +1,5 @@
 """The left image and the arguments of a guided call are checked before anything runs."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

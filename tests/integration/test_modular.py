@@ -1,7 +1,5 @@
 """Marigold as modular blocks: every stage alone, and both pipelines equal to the classic calls."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil

@@ -1,7 +1,5 @@
 """The notebook runs from top to bottom, without a network, and shows what it promises."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """``examples/proof.py`` on random weights: every prior that is here is run, others are listed as absent."""
 
-from __future__ import annotations
-
 import numpy as np
 from PIL import Image
 

@@ -1,7 +1,5 @@
 """The example model of the robustmvd benchmark: its form, its poses, its metrics."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What rounds of one step are anchored to, and what of the matches the result believes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

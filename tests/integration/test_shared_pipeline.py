@@ -1,7 +1,5 @@
 """A guided call beside other calls: shared components, callbacks, replaced methods, threads."""
 
-from __future__ import annotations
-
 import copy
 import threading
 from concurrent.futures import ThreadPoolExecutor

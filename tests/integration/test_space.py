@@ -1,7 +1,5 @@
 """The Space's app, started as the Space starts it and asked through gradio's own client."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """torch's number of threads in a guided call: within the cores, and afterwards as it was found."""
 
-from __future__ import annotations
-
 import os
 import threading
 

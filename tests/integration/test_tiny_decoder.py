@@ -1,7 +1,5 @@
 """``decoder``: a tiny autoencoder between the steps, the prior's own for the result."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

@@ -1,7 +1,5 @@
 """torch's default device and dtype are the user's: nothing that is computed reads either."""
 
-from __future__ import annotations
-
 from contextlib import contextmanager
 
 import numpy as np

@@ -1,7 +1,5 @@
 """More than two views, known points, and both: end to end on a rendered scene and the bundled prior."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

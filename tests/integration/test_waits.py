@@ -1,7 +1,5 @@
 """Nothing between the first denoising step and the last waits for a device: no number is read back."""
 
-from __future__ import annotations
-
 import traceback
 from collections import Counter
 

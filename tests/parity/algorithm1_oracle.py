@@ -4,8 +4,6 @@ Nothing of ``geodiff_plugin`` is imported: warp, SSIM, noise arithmetic and auto
 that the paper leaves open are those of docs/reference/paper-map.md (E1 to E19), restated here.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 

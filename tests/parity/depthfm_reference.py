@@ -8,8 +8,6 @@ The configurations below are what the parity test builds our pipeline from. Thei
 copied; xformers is replaced by PyTorch's own attention, which computes the same.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

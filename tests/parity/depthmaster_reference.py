@@ -9,8 +9,6 @@ The configurations below are what the parity test builds our pipeline from. Thei
 copied; torchvision is replaced by the two functions that are called.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import sys

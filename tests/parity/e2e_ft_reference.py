@@ -9,8 +9,6 @@ The configurations below are what the parity test builds our pipeline from. Thei
 copied; torchvision, which it imports for two functions, is replaced by what they do.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

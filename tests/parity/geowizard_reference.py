@@ -9,8 +9,6 @@ The configurations below are what the parity test builds our pipeline from. Thei
 copied; torchvision's resize and xformers' attention are replaced by the torch functions they wrap.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -8,8 +8,6 @@ The configurations below are what the parity test builds our pipeline from. Thei
 copied; of torchvision it needs one function, given here as the torch function that it wraps.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

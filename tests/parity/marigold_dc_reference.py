@@ -8,8 +8,6 @@ From the root of this repository, with the environment of the tests::
 below are what the parity test builds our pipeline from. Their code is imported, not copied.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -9,8 +9,6 @@ Their graph of one step is imported, not copied; their registry is replaced by a
 on by peft with their list of targets, and weights are loaded as they load them: not strictly.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import sys

@@ -5,8 +5,6 @@ Needs numpy and torch only. Every parameter and floating buffer is drawn, also t
 zero: a network whose last layer is zero answers zero, and parity with it would say nothing.
 """
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np

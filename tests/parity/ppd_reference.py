@@ -8,8 +8,6 @@ Their networks, sampler and resizing are imported, not copied; torchvision, timm
 empty modules, since nothing of them is called here but a helper that makes a pair of a number.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import types

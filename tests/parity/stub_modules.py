@@ -1,7 +1,5 @@
 """Empty modules in the place of packages that the authors' code imports and does not need."""
 
-from __future__ import annotations
-
 import sys
 import types
 from importlib.machinery import ModuleSpec

@@ -1,7 +1,5 @@
 """The ``paper`` preset of a live pipeline is Algorithm 1, step by step."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

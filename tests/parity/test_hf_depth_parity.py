@@ -1,7 +1,5 @@
 """Preparation and map of ``transformers`` depth models against its processors that need no torchvision."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from types import ModuleType, SimpleNamespace

@@ -1,7 +1,5 @@
 """Our warp against kornia's one-call warp, for equal intrinsics and size."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Marigold-DC: our preset against the authors' own code on the same random weights and the same points."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

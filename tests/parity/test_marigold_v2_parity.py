@@ -1,7 +1,5 @@
 """Marigold V2: ``geodiff convert`` and our pipeline against the authors' own step on the same weights."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Parts of the method against small versions of them in NumPy, with their constants written out again."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

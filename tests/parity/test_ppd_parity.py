@@ -1,7 +1,5 @@
 """Pixel-Perfect Depth: ``geodiff convert`` and our pipeline against the authors' own code, same weights."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

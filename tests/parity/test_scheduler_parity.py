@@ -1,7 +1,5 @@
 """Our arithmetic against every supported scheduler's own ``step``."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from diffusers import (

@@ -1,7 +1,5 @@
 """Priors on Stable Diffusion's networks against the authors' own code: same random weights, same draws."""
 
-from __future__ import annotations
-
 import json
 import string
 from pathlib import Path

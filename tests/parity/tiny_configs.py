@@ -1,7 +1,5 @@
 """What the tiny Stable-Diffusion-like networks of several authors' references have in common."""
 
-from __future__ import annotations
-
 UNET = {
     "sample_size": 8,
     "out_channels": 4,

@@ -1,7 +1,5 @@
 """A room with painted walls, seen by one camera on a walk: exact images, depth and poses, in milliseconds."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The page's parts: ruler, cameras, jobs, pictures, files, and what visitors read."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import json

@@ -1,7 +1,5 @@
 """Bags: pairs by their time stamps, every encoding, cameras of raw and rectified images, depth read back."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

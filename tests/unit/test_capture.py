@@ -1,7 +1,5 @@
 """Poses of a capture solved together, neighbours, agreement and fusion, on a painted room."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,7 +19,7 @@ from geodiff_plugin.capture.capture import choose_neighbours
 from geodiff_plugin.capture.fusion import fuse, write_map
 from geodiff_plugin.capture.options import CaptureOptions
 from geodiff_plugin.evaluation.baselines import PriorCache
-from geodiff_plugin.evaluation.frames import f_score, temporal_error
+from geodiff_plugin.evaluation.frames import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
 from geodiff_plugin.pose.capture import SolvedCapture, candidate_pairs, solve_capture
 from tests.unit.capture_room import FLIP, HALF, SIZE, K, perturbed, render, walk, write_transforms
@@ -108,21 +106,6 @@ def test_a_blurred_frame_keeps_its_pose_and_is_named():
     assert all(4 not in choose_neighbours(found, frame, 4) for frame in (3, 5))
 
 
-def test_a_frame_that_fits_worse_than_it_was_given_keeps_its_pose(monkeypatch):
-    halves = iter([[np.full(99, 1.0)] * 45, [np.full(99, 0.2)] * 45])
-
-    def residuals(E, K, matches):
-        distances = next(halves)[: len(matches)]
-        if distances[0][0] < 1:
-            distances = [d * 9 if 7 in pair[:2] else d for d, pair in zip(distances, matches, strict=True)]
-        return distances
-
-    monkeypatch.setattr("geodiff_plugin.pose.capture._in_convention", lambda base, E, notes: E)
-    monkeypatch.setattr("geodiff_plugin.pose.capture._residuals_px", residuals)
-    found = solve(GIVEN)
-    assert found.status == "solved" and np.flatnonzero(~found.connected).tolist() == [7]
-
-
 @pytest.mark.slow
 def test_from_nothing_up_to_a_similarity():
     found = solve(None)
@@ -137,18 +120,6 @@ def test_frames_of_nothing_in_common_are_refused():
     pairs = candidate_pairs(np.concatenate([walk(20), walk(20)]), 40)
     assert (0, 1) in pairs and (0, 20) in pairs, "followers and revisits"
     assert all(i < j for i, j in pairs) and len(pairs) == len(set(pairs))
-
-
-def test_neighbours_see_the_frame_under_an_angle():
-    found = solved()
-    for frame in range(COUNT):
-        chosen = choose_neighbours(found, frame, 3)
-        assert 1 <= len(chosen) <= 3 and frame not in chosen and len(set(chosen)) == len(chosen)
-        assert choose_neighbours(found, frame, 1) == chosen[:1]
-    still = replace(found, E=np.where(np.arange(COUNT)[:, None, None] == 5, found.E[4], found.E))
-    assert choose_neighbours(still, 4, 1) != [5]  # at one place there is no baseline
-    blind = replace(found, seen=tuple(replace(s, px=s.px[:0], point=s.point[:0]) for s in found.seen))
-    assert choose_neighbours(blind, 0, 2) == [1, 2]  # near by position
 
 
 def depth_frame(i: int, factor: float = 1.0, confidence: float = 0.6) -> DepthFrame:
@@ -190,13 +161,10 @@ def test_the_cloud_lies_on_the_walls_and_its_normals_look_inside(tmp_path):
     np.testing.assert_array_equal(np.frombuffer(data, "<f4").reshape(2, 3, 4), values.transpose(2, 0, 1))
 
 
-def test_scores_of_clouds_and_of_frames_in_turn():
+def test_f_score_of_clouds():
     grid = np.stack(np.meshgrid(*[np.arange(4) * 0.2] * 3), -1).reshape(-1, 3)
     assert f_score(grid + 0.02, grid) == 1.0 and f_score(grid[:0], grid) == 0.0
     assert f_score(grid[:32], grid) == pytest.approx(2 / 3)  # all right, half of it there
-    still = [depth_frame(i) for i in (3, 4, 5)]
-    breathing = [depth_frame(3), depth_frame(4, 1.05), depth_frame(5)]
-    assert temporal_error(still) < 0.5 and temporal_error(breathing) == pytest.approx(5, abs=0.6)
 
 
 def depth_by(factor: Callable[[Capture], float], **more):
@@ -311,11 +279,8 @@ def test_one_length_gives_all_and_without_one_nothing_says_metres(way, model, tm
     ("options", "words"),
     [
         ({"distance": "f01,f01,1"}, "different positions"),
-        ({"distance": "f01,1"}, "NAME,NAME,METRES"),
-        ({"distance": "f01,f02,-1"}, "above 0"),
         ({"known_length": "f01:1,2,3,4"}, "NAME:X1,Y1,X2,Y2,METRES"),
         ({"known_length": "f01:1,2,999,4,1"}, "240x180"),
-        ({"known_length": "f01:1,2,x,4,1"}, "numbers"),
         ({"known_length": "f77:1,2,3,4,1"}, "f77"),
         ({"points": "depth"}, "without a unit"),
     ],

@@ -1,7 +1,5 @@
 """Readers of captures: every layout gives the same frames, and bad input a sentence."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -99,12 +97,6 @@ def test_every_layout_gives_the_same_frames(write, tmp_path):
     assert (files.frames[3].depth is not None) == (write in (transforms, scannet, tum))
 
 
-def test_frames_of_a_model_have_the_points_that_they_see(tmp_path):
-    frames = read_capture(colmap_text(tmp_path)).frames
-    assert [frame.points is None for frame in frames] == [False, False, True, False]
-    assert frames[3].points.tolist() == [[0.5, 0.25, 2.6]]
-
-
 def test_a_video_takes_its_poses_from_a_trajectory(tmp_path):
     writer = cv2.VideoWriter(str(tmp_path / "v.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, SIZE)
     for image in IMAGES:
@@ -137,15 +129,6 @@ def test_units_and_lenses_of_transforms(tmp_path):
     (folder / "transforms.json").write_text(json.dumps(data))
     assert read_capture(folder).unit is None
     assert read_capture(folder).frames[0].depth == folder / "depth/f00.png"
-
-
-def test_smaller_images_have_their_K(tmp_path):
-    folder = write_transforms(tmp_path, TRUE, TRUE)
-    for path in (folder / "images").iterdir():
-        Image.open(path).resize((SIZE[0] // 2, SIZE[1] // 2)).save(path)
-    small = read_capture(folder).frames[0].K
-    np.testing.assert_allclose(small[0, 2] + 0.5, (K[0, 2] + 0.5) / 2)
-    np.testing.assert_allclose(small[1, 1], K[1, 1] / 2)
 
 
 def crop(folder: Path, data: dict) -> None:

@@ -1,7 +1,5 @@
 """COLMAP models: folders, models with all their points, binary files as COLMAP writes them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The configuration: what a knob may be, how it is saved, typed on a command line, and told."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import json
@@ -74,16 +72,11 @@ def test_a_configuration_does_not_change():
     [
         ({"correct": 1}, TypeError, "correct must be True or False; got int"),
         ({"smoothness": float("nan")}, ValueError, "smoothness.*nan"),
-        ({"smoothness": True}, TypeError, "smoothness must be a number"),
-        ({"eta": None}, TypeError, "eta"),
         ({"inner_steps": 2.0}, TypeError, "inner_steps must be an integer"),
-        ({"g_s_range": None}, TypeError, "g_s_range"),
         ({"depth_range": [2.0, 1.0]}, ValueError, "depth_range"),
-        ({"rule": 3}, TypeError, "rule"),
         ({"weights": {"matches": float("nan")}}, ValueError, "matches"),
         ({"start": 0.9, "stop": 0.5}, ValueError, "start"),
         ({"colour": 1}, ValueError, "'colour'.*There are: gradient"),
-        ({"inertia": 0.1}, ValueError, "'inertia'"),
     ],
 )
 def test_what_a_knob_cannot_be_is_refused(knobs, error, message):
@@ -119,13 +112,6 @@ def test_knobs_as_typed():
 def test_what_is_no_knob_is_told_with_those_that_are(typed):
     with pytest.raises(InputError, match="--knob must be KNOB=VALUE.*inner_steps.*weights.NAME"):
         config_from_text([typed], DEFAULT, "--knob")
-
-
-def test_a_value_by_name():
-    assert value_of("smoothness", DEFAULT) == 40.0 and value_of("weights.matches", DEFAULT) == 1.0
-    assert value_of("inner_steps", DEFAULT) == 0
-    with pytest.raises(InputError, match="smoothnes"):
-        value_of("smoothnes", DEFAULT)
 
 
 def tables():

@@ -1,7 +1,5 @@
 """Every line of docs/reference/conventions.md that can be tested, one test a line."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

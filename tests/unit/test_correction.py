@@ -1,9 +1,6 @@
 """The edge-aware fit to matches: it stops at edges, and what it is fitted to; its numbers are those of
 ``tests/parity/test_numpy_references.py``."""
 
-from __future__ import annotations
-
-import pytest
 import torch
 
 from geodiff_plugin.algorithm.correction import correction_target, off_edges, refine_depth
@@ -32,15 +29,6 @@ def test_a_correction_spreads_over_its_surface_and_stops_at_an_edge():
     assert (own / 2.0 - 1.0).abs().max() < 0.09
     assert (other / 2.4 - 1.0).abs().max() < 0.09  # half of what the surface beside it moved by
     assert support[..., 10:14].min() > 0.3 and support[..., 31:].max() < 0.1
-
-
-def test_samples_of_a_batch_do_not_mix_and_any_resolution_comes_back():
-    truth, given = torch.full((2, 1, *SIZE), 3.0), torch.full((2, 1, 90, 130), 3.3)
-    confidence = torch.stack([torch.ones(1, *SIZE), torch.zeros(1, *SIZE)])
-    left, error = grey().expand(2, -1, -1, -1), WEAK.expand(2, 1, 1, 1)
-    depth_m, support, _ = refine_depth(given, matches_at(truth, confidence), left, error)
-    assert depth_m[0].mean() == pytest.approx(3.0, rel=0.01)
-    assert torch.equal(depth_m[1], given[1]) and support[1].max() == 0.0  # without a match nothing moves
 
 
 def test_beside_an_edge_of_a_good_map_a_match_counts_for_less_and_a_point_does_not():

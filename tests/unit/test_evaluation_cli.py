@@ -1,26 +1,21 @@
 """The eval commands on own images in Middlebury's layout and on rendered ones, with methods that are free."""
 
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import InputError
 from geodiff_plugin.evaluation import experiment
 from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS
 from geodiff_plugin.evaluation.calibrations import run_poses
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import changed_ref
-from geodiff_plugin.evaluation.options import COMMANDS, DirOptions, PosesOptions, command_line
-from tests.evaluating import SHIFT, SIZE, invoke, write_scenes
+from geodiff_plugin.evaluation.options import PosesOptions
+from tests.evaluating import invoke, write_scenes
 
 
 @pytest.fixture
@@ -51,17 +46,6 @@ def test_pairs_selects_draws_and_says_so(data, tmp_path):
     picked = ["middlebury2014/two" in said for said in drawn]
     assert picked[0] == picked[-1] and set(picked) == {True, False}
     assert "Drawn with seed 0: middlebury2014/" in drawn[0]
-
-
-def test_pairs_reads_maps_made_elsewhere_and_writes_down_how(data, tmp_path):
-    maps = tmp_path / "RAFT-Stereo"
-    maps.mkdir()
-    np.save(maps / "middlebury2014_one.npy", np.full(SIZE, SHIFT, np.float32))
-    words = ("pairs", data, "--methods", f"files:disparity:{maps}", "--scenes", "one", "-o", tmp_path / "out")
-    said = invoke(*words, "--crop", "eigen", "--prior", "one", "--space", "disparity")
-    assert re.search(r"middlebury2014/one +0\.000\n", said) and "RAFT-Stereo" in said
-    for word in ("--prior one --space disparity", "--crop eigen", "the crop 'eigen'", "Prior one, seed 0"):
-        assert word in said
 
 
 def test_pairs_goes_on_after_a_broken_sample_on_request_and_tries_it_again(data, tmp_path):
@@ -100,38 +84,10 @@ def test_bad_options_are_named(data, tmp_path, words, said):
         invoke(*(folders.get(word, word) for word in words.split()), "-o", tmp_path / "out")
 
 
-@pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_out_that_can_be_no_folder_is_told_at_once(tmp_path, command):
-    (tmp_path / "file").write_text("")
-    arguments = {"pairs": ["DIR"], "capture": ["DIR"], "figure": ["terms"]}.get(command, ())
-    with pytest.raises(InputError, match="--out must be a folder; got the file"):
-        invoke(command, *arguments, "--out", tmp_path / "file")
-
-
 def test_list_tells_what_is_there(data):
     said = invoke("list", "--data", data)
     assert re.search(r"middlebury2014 +2 samples", said) and re.search(r"kitti2015 +not found", said)
     assert all(name in said for name in ("https://", *DATASETS, *METHODS, *FAMILIES))
-
-
-def test_options_come_back_as_a_command_line():
-    given = {"data": Path("synthetic-posed:2"), "methods": ("guided",), "perturb": "1.5,0.1"}
-    options = DirOptions(**given, crop="garg", limit=3, out=Path("x"), quiet=True)
-    words = command_line("pairs", options).split()
-    expected = "synthetic-posed:2 --methods guided --limit 3 --perturb 1.5,0.1 --crop garg".split()
-    assert words[:3] == ["geodiff", "eval", "pairs"] and sorted(words[3:]) == sorted(expected)
-
-
-def test_two_processes_share_the_samples(data, tmp_path):
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    command += ["-m", "geodiff_plugin", "eval", "pairs", data, "--methods", "sgbm", "-o", tmp_path / "out"]
-    environment = os.environ | {"ACCELERATE_USE_CPU": "true", "OMP_NUM_THREADS": "1"}
-    words = [str(word) for word in command]
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr
-    assert "2 processes" in done.stdout
-    assert sorted(line["sample"] for line in lines_of(tmp_path / "out")) == ["one", "two"]
-    assert {line["process"] for line in lines_of(tmp_path / "out")} <= {0, 1}
 
 
 def test_changed_samples_differ_in_what_was_changed_only():

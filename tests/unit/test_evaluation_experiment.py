@@ -1,7 +1,6 @@
 """Cells and their records: resuming, saved maps, seeds and priors, and the tables of a comparison."""
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -93,16 +92,6 @@ def test_a_saved_map_is_that_of_the_record(bench):
     np.testing.assert_array_equal(maps[0], maps[2])
     bench.go(save_depth=True)
     assert bench.calls == [] and len(list(bench.out.glob("depth/*/*.npy"))) == 5
-
-
-def test_crop_is_scored_and_is_another_result(bench):
-    bench.go()
-    image, depth_m = np.zeros((50, 60, 3), np.uint8), np.full((50, 60), 2.0, np.float32)
-    changed = {"left": image, "right": image, "depth_m": depth_m, "valid": depth_m > 0}
-    bench.samples["a"] = replace(bench.samples["a"], **changed)
-    (record,) = bench.go(["exact"], refs=REFS[:1], crop="garg")
-    rows, columns = int(0.99189189 * 50) - int(0.40810811 * 50), int(0.96405229 * 60) - int(0.03594771 * 60)
-    assert len(bench.calls) == 1 and record["all_pixels"]["raw"]["pixels"] == rows * columns
 
 
 def test_tables_hold_pairs_means_and_differences(bench):

@@ -62,16 +62,6 @@ def test_relative_depth_has_no_raw_column_and_holes_no_errors():
     assert headline({"status": "ok"} | holes) is None
 
 
-def test_uncertainty_and_confidence_are_scored():
-    sample, error = make_sample(), np.arange(48).reshape(SHAPE) / 100
-    prediction = Prediction(
-        sample.depth_m * (1 + error), uncertainty=error, confidence=1 - error / error.max()
-    )
-    record = score(sample, prediction, None)
-    assert record["ause"] == pytest.approx(0, abs=1e-6) == record["ause_confidence"]["ause"]
-    assert record["ause_confidence"]["random"] > 0.05 and len(record["confidence"]) == 10
-
-
 def test_poses_given_wrongly_change_no_mask_and_no_true_disparity(monkeypatch):
     sample, swept = make_sample(), []
     wrong = with_perturbed_poses(sample, (20.0, 0.5), "a")

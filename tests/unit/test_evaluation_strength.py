@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy.stats import spearmanr
 
 from geodiff_plugin._checks import InputError
@@ -13,7 +12,7 @@ from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, find_met
 from geodiff_plugin.evaluation.calibrations import KINDS, POINTS, RIGHT, WRONG
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.options import STRENGTHS, StrengthOptions, TrustOptions
-from geodiff_plugin.evaluation.strength import EmulatedPrior, relative_map, run_strength
+from geodiff_plugin.evaluation.strength import relative_map, run_strength
 
 SMALL = "synthetic:1+4@128x96"
 
@@ -33,23 +32,6 @@ def test_a_prior_errs_as_much_as_it_says(sample, space):
     inner = sample.valid & (exact > 0.05) & (exact < 0.95)
     ranks = spearmanr(exact[inner], sample.depth_m[inner]).statistic  # without an error, one orders the other
     assert ranks == pytest.approx(-1.0 if space == "disparity" else 1.0, abs=1e-6)
-
-
-@pytest.mark.parametrize("follow", [0.0, 0.6])
-def test_its_answer_follows_its_input_as_far_as_asked(sample, follow):
-    prior = EmulatedPrior("disparity", follow)
-    prior.answer(sample, STRENGTHS["exact"], 64)
-    scheduler, own = prior.pipe.scheduler, prior.pipe.unet.code
-    scheduler.set_timesteps(2)
-    noise = torch.randn(own.shape, generator=torch.Generator().manual_seed(0))
-    image = torch.zeros_like(own)
-    first, second = scheduler.timesteps
-    v = prior.pipe.unet(torch.cat([image, noise], 1), first)[0]
-    moved = scheduler.step(v, first, noise).prev_sample
-    moved = moved + scheduler.alphas_cumprod[second].sqrt() * 0.5  # an edit of 0.5 in the clean latent
-    v = prior.pipe.unet(torch.cat([image, moved], 1), second)[0]
-    z0 = scheduler.step(v, second, moved).pred_original_sample
-    torch.testing.assert_close(z0 - own, torch.full_like(own, follow * 0.5), atol=2e-3, rtol=0)
 
 
 def test_the_command_writes_a_page_and_goes_on_where_it_stopped(tmp_path, monkeypatch):

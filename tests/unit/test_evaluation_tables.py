@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from geodiff_plugin.evaluation import pairs, paper
-from geodiff_plugin.evaluation.baselines import Method, NotApplicable, Prediction, Settings, find_method
-from geodiff_plugin.evaluation.pairs import CHANGES, FLATNESS, changes_table, flatness_table
+from geodiff_plugin.evaluation.baselines import Method, NotApplicable, Prediction, find_method
+from geodiff_plugin.evaluation.pairs import CHANGES, FLATNESS, changes_table
 from geodiff_plugin.evaluation.paper import LAYOUTS, layout_table
-from geodiff_plugin.evaluation.tables import Table, label_of
 from tests.contracts.tiny_transformers import make_transformers
 from tests.evaluating import invoke, write_scenes
 
@@ -50,17 +49,6 @@ def test_published_numbers_stand_beside_the_full_set_only(count):
     assert "hf:Intel/zoedepth-nyu-kitti" in table.note and "Not run here" in table.note
 
 
-def test_columns_and_rows_are_the_papers():
-    other = columns_of(LAYOUTS["table1"], 15, 2, "middlebury2014")[2]
-    assert not other.complete and other.heading == "Middlebury (middlebury2014, 15 pairs)"
-    counts = [c.full_count for name in ("table1", "table3") for c in LAYOUTS[name].columns]
-    assert counts == [200, 228, 15, 116] and [len(own.rows) for own in LAYOUTS.values()] == [8, 4, 4, 2]
-    for name, layout in LAYOUTS.items():
-        cells = [cells for row in layout.rows for cells in row.published.values()]
-        assert [len(own) for own in cells] == [len(layout.metrics)] * len(layout.rows) * len(layout.columns)
-        assert all(find_method(method).name == method for method in paper.methods_of(name, ()))
-
-
 def test_a_mean_needs_every_pair_and_a_method_fills_the_row_that_has_its_word(monkeypatch):
     peer = Method("files:maps/unidepth", "UniDepth files", "", lambda *_: None, lambda _: {}, False)
     find = paper.find_method
@@ -86,23 +74,6 @@ def test_changes_are_compared_pair_by_pair():
     assert rows["without matches"][3] == "0.340"  # the worst pair
 
 
-@pytest.mark.parametrize("base", ["guided", "paper"])
-def test_changes_are_configurations_of_the_guidance(base):
-    changed = {name for own in CHANGES.values() for _, name in own if name.startswith(f"{base}:")}
-    configured = [find_method(name).configuration(Settings())["guidance"] for name in changed]
-    # The default's own rule may be the one that a row names; every other row changes something.
-    assert find_method(base).configuration(Settings())["guidance"] not in configured
-
-
-def test_flatness_tries_every_number_at_half_and_at_twice():
-    assert len(FLATNESS) == 1 + 2 * len(pairs.NUMBERS) == len(set(FLATNESS))
-    assert "guided:outlier_width=6" in FLATNESS and "guided:smoothness=80" in FLATNESS
-    records = [make_record(n, "0", 0.2 if n.endswith("smoothness=80") else 0.1, 1.0) for n in FLATNESS]
-    rows = {row[0]: row for row in flatness_table(records).rows}
-    assert rows["`smoothness`"][1:] == ("40", "0.1000", "0.2000", f"0.100 ({label_of(records[0])})")
-    assert rows["`min_steps`"][-1] == "0.000"
-
-
 def test_cost_is_told_as_multiples_of_the_plain_pipeline(tmp_path):
     records = [make_record("prior-aligned", str(i), None, 0.1, seconds=s) for i, s in enumerate((9, 1, 2))]
     records += [make_record("guided", str(i), 0.1, 0.1, seconds=6.0, peak_bytes=20_000_000) for i in range(3)]
@@ -114,11 +85,6 @@ def test_cost_is_told_as_multiples_of_the_plain_pipeline(tmp_path):
         pairs.cost_table([records[0] | {"status": "broken"}])
     make_transformers("glpn").save_pretrained(tmp_path)  # asked for no more steps than it was trained for
     assert pairs._steps_of("bundled") == pairs.STEPS and pairs._steps_of(str(tmp_path)) is None
-
-
-def test_a_table_in_markdown_has_its_groups_in_the_headings():
-    text = Table("T", ("Method", "A", "B"), (("x|y", "1", "2"),), "", (("", 1), ("One", 2))).markdown()
-    assert r"| Method | One: A | One: B |" in text and r"| x\|y | 1 | 2 |" in text
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Evidence is made once for one pair and one setting, and anew for everything else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

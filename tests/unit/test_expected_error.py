@@ -1,7 +1,5 @@
 """The error that the geometry lets a matched depth have, against triangulation of shifted matches."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -27,10 +25,3 @@ def test_a_match_shifted_by_its_noise_gives_it(moved):
     pixels_a_metre = np.linalg.norm(seen(z + 1e-5) - seen(z - 1e-5)) / 2e-5
     error = expected_error(np.full((24, 40), z), K, [E])[row, column]
     assert error == pytest.approx(MATCH_NOISE_PX / pixels_a_metre, rel=1e-6)
-
-
-def test_the_best_of_several_views_counts_and_none_knows_nothing():
-    depth_m, far = np.full((4, 6), 3.0), pose(0.4, 0, 0)
-    both = expected_error(depth_m, K, [pose(0.1, 0, 0), far])
-    np.testing.assert_array_equal(both, expected_error(depth_m, K, [far]))
-    assert np.isinf(expected_error(depth_m, K, [])).all()

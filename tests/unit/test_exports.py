@@ -1,7 +1,5 @@
 """GLB and COLMAP exports: read back by code that shares nothing with the writers."""
 
-from __future__ import annotations
-
 import json
 import struct
 

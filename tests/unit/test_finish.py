@@ -1,7 +1,5 @@
 """The last stage: blurred edges become steep, and matches, colours and a good map decide where they are."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torch.nn.functional as F

@@ -1,7 +1,5 @@
 """What is special in single formats: which cameras, which resolution, which names, which lens."""
 
-from __future__ import annotations
-
 import json
 import re
 from functools import partial
@@ -165,10 +163,7 @@ def test_opencv_in_two_files(tmp_path):
     [
         "cameraMatrix1 distCoeffs1 cameraMatrix2 distCoeffs2 R T",
         "K_left dist_left K_right dist_right R T",
-        "Ml dl Mr dr R T",
         "mtxL distL mtxR distR Rot Trans",
-        "cameraMatrixL distCoeffsL cameraMatrixR distCoeffsR RotationMatrix TranslationVector",
-        "left_camera_matrix left_distortion_coeffs right_camera_matrix right_distortion_coefficients R T",
         "Camera_Matrix_1 Distortion_Coeffs_1 Camera_Matrix_2 Distortion_Coeffs_2 rotation Translation_Vector",
     ],
 )

@@ -1,7 +1,5 @@
 """Lens distortion taken out of images."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

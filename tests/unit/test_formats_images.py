@@ -1,7 +1,5 @@
 """Images from files and from memory."""
 
-from __future__ import annotations
-
 import io
 import warnings
 
@@ -152,18 +150,12 @@ def with_value(value):
 @pytest.mark.parametrize(
     ("value", "error", "match"),
     [
-        (with_value(np.nan), ValueError, "right must be finite"),
-        (with_value(200.0), ValueError, r"\[0, 1\].*200.*Divide by 255"),
         (with_value(-0.9), ValueError, r"-0\.9.*\(x \+ 1\) / 2"),
         (np.zeros((1, H, W, 3)), ValueError, "batch"),
         (torch.zeros(1, 3, H, W), ValueError, r"value\[0\]"),
         (torch.zeros(H, W), ValueError, r"value\[None\]"),
-        (np.zeros((3, H, W)), ValueError, r"transpose\(1, 2, 0\)"),
         (torch.zeros(H, W, 3), ValueError, r"permute\(2, 0, 1\)"),
         (np.zeros((H, W, 2)), ValueError, "1, 3 or 4 channels"),
-        (np.zeros((H, W, 3), dtype=np.int64), ValueError, "dtype int64"),
-        (np.zeros((H, W, 3), dtype=bool), ValueError, "dtype bool"),
-        (np.zeros((31, W, 3)), ValueError, "at least 32"),
         ("left.png", TypeError, "right must be a PIL image.*got str"),
     ],
 )

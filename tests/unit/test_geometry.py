@@ -1,7 +1,5 @@
 """Cameras, projection, warping: against ``z (u, v, 1) = K p`` in NumPy, with a skew and in any pose."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

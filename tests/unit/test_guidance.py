@@ -1,13 +1,10 @@
 """``GeometryGuidance``: the forms of its arguments, refusals, warnings, constructors and presets."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, InputError
 from geodiff_plugin.config import DEFAULT, PAPER, PRESETS, GuidanceConfig
@@ -97,43 +94,24 @@ def test_points_of_either_form():
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"K": np.eye(4)}, ValueError, "K must be a 3x3"),
         ({"K": "calib.txt"}, TypeError, "K must be"),
-        ({"K": put(K, (0, 0), 0.0)}, ValueError, "focal"),
         ({"K": K_OFF}, ValueError, "another resolution"),
-        ({"E": np.eye(3)}, ValueError, "E must be a 4x4"),
-        ({"E": I4}, ValueError, "baseline"),
         ({"E": put(E, (0, 0), 2.0)}, ValueError, "rigid"),
-        ({"E": put(E, (3, 0), 0.1)}, ValueError, "last row"),
-        ({"E": put(E, (1, 3), np.inf)}, ValueError, "finite"),
         ({"right": RIGHT.astype(np.float32)}, ValueError, "right"),
         ({"right": None}, ValueError, "right must be an image, or None together with points"),
         ({"right": None, "points": POINTS}, ValueError, "E must be None without a right view"),
         ({"right": [RIGHT, RIGHT], "E": [E]}, ValueError, "E must be a list of 2 entries"),
         ({"right": (RIGHT, RIGHT)}, TypeError, "E must be a tuple"),
         ({"right": (RIGHT, RIGHT), "E": (I4, E)}, ValueError, "a tuple of 2 for 2 right views"),
-        (
-            {"right": [RIGHT, None], "E": [E, None], "points": [POINTS] * 2},
-            ValueError,
-            "right must be given for",
-        ),
-        ({"points": np.ones((4, 2))}, ValueError, "points must be a sparse depth map"),
-        ({"points": np.zeros(SIZE)}, ValueError, "at least one of them known"),
+        ({"right": [RIGHT, None], "E": [E, None], "points": [POINTS] * 2}, ValueError, "right must be given"),
         ({"left_size": "64x48"}, TypeError, "left_size must be"),
         ({"unit": "mm"}, ValueError, "unit must be 'm' or None"),
-        ({"rule": "sgd"}, ValueError, "rule"),
-        ({"weights": {"smooth": 1.0}}, ValueError, "weights"),
-        ({"smoothnes": 1.0}, ValueError, "smoothnes.*Did you mean smoothness"),
         ({"config": {"gradient": "full"}}, TypeError, "config must be a GuidanceConfig"),
         ({"preset": "fast"}, ValueError, "preset must be one of default"),
         ({"preset": "paper", "config": PAPER}, ValueError, "preset must be None beside config"),
         ({"search": "one-number", "weights": {"matches": 1.0}}, ValueError, "photometric weight"),
         ({"search": "points-range"}, ValueError, "'points-range' needs points"),
-        (
-            {"right": None, "E": None, "points": POINTS, "weights": {"matches": 1}},
-            ValueError,
-            "weights must be",
-        ),
+        ({"right": None, "E": None, "points": POINTS, "weights": {"matches": 1}}, ValueError, "weights must"),
         ({"previous": 3}, TypeError, "previous must be a MetricDepthOutput"),
     ],
 )
@@ -141,20 +119,6 @@ def test_bad_input_names_the_argument(changes, error, message):
     with pytest.raises(error, match=message) as caught:
         GeometryGuidance(**({"right": RIGHT, "K": K, "E": E} | changes))
     assert isinstance(caught.value, InputError)
-
-
-@pytest.mark.parametrize(
-    ("views", "error", "message"),
-    [
-        ([(RIGHT, K, I4)], ValueError, "views must be a list"),
-        ({"left": RIGHT}, TypeError, "views must be a list"),
-        ([(RIGHT, K_OFF, I4), (RIGHT, K, E)], ValueError, r"K\[left\] must be for the left view's"),
-        ([(None, K, I4), (RIGHT, K, E), (RIGHT, K_OFF, E)], ValueError, r"K\[right view 2\]"),
-    ],
-)
-def test_bad_views_are_named(views, error, message):
-    with pytest.raises(error, match=message):
-        GeometryGuidance.from_views(views)
 
 
 @pytest.mark.parametrize(
@@ -171,21 +135,6 @@ def test_intrinsics_of_another_size_or_mistyped(fx, fy, cx, cy, words):
     odd = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float)
     sentences = said_by(lambda: GeometryGuidance(RIGHT, odd, E))
     assert [words in sentence for sentence in sentences] == ([] if words is None else [True])
-
-
-def test_what_else_is_suspected():
-    border = K - [[0, 0, 25], [0, 0, 19], [0, 0, 0]]
-    sentences = said_by(lambda: GeometryGuidance((RIGHT, RIGHT), (K, border, border), (I4, E, E)))
-    names = [sentence.split(" has its principal point")[0] for sentence in sentences]
-    assert names == ["K[right view 1]", "K[right view 2]"]
-    assert "millimetres" in said_by(lambda: GeometryGuidance.from_baseline(RIGHT, K, 120.0))[0]
-    assert not said_by(lambda: GeometryGuidance.from_baseline(RIGHT, K, 120.0, unit=None))
-    picture = Image.fromarray(RIGHT)
-    picture.getexif().get_ifd(0x8769)[0xA405] = 32  # 59 px for 64x48
-    assert not said_by(lambda: GeometryGuidance(picture, K, E))
-    wrong = K * np.array([[1.5, 1.5, 1], [1.5, 1.5, 1], [1, 1, 1]])
-    (sentence,) = said_by(lambda: GeometryGuidance(picture, wrong, E))
-    assert "right, 1.5" in sentence and "EXIF" in sentence
 
 
 def test_a_crop_says_so():

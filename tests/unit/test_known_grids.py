@@ -1,7 +1,5 @@
 """What is known of a view, on the grid of the evidence: images larger than the grid, little overlap."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

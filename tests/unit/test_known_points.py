@@ -1,7 +1,5 @@
 """Known points on the grid of the losses, their confidence, and what contradicts the views."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -40,23 +38,6 @@ def test_the_nearest_point_of_a_cell_brings_its_confidence() -> None:
     np.testing.assert_allclose(matches.confidence[0], expected, atol=1e-6)
     np.testing.assert_allclose(matches.inverse_depth[0], 1 / depth, rtol=1e-5)
     assert [float(m) for m in depth_span(matches)] == pytest.approx([depth.min(), depth[depth < 99].max()])
-
-
-def test_a_map_with_confidence_is_its_points_with_theirs() -> None:
-    rng = np.random.default_rng(1)
-    depth = np.where(rng.random(SIZE) < 0.3, rng.uniform(2, 9, SIZE), 0.0).astype(np.float32)
-    confidence = rng.random(SIZE).astype(np.float32)
-    confidence[::3], confidence[1::3, ::2] = 0.0, np.nan
-    (rows, columns), inverse = np.nonzero(depth), np.linalg.inv(K.double().numpy())
-    xyz = np.stack([columns, rows, np.ones_like(rows)], 1) @ inverse.T * depth[rows, columns, None]
-    ones = (as_points(depth, "points", confidence), as_points(xyz, "points", confidence[rows, columns]))
-    of_map, of_list = (points_to_matches(given, K, SIZE, SIZE)[0] for given in ones)
-    torch.testing.assert_close(of_map.confidence, of_list.confidence)
-    torch.testing.assert_close(of_map.inverse_depth, of_list.inverse_depth)
-    plain, left_out = points_to_matches(as_points(depth, "points"), K, SIZE, SIZE)
-    full, _ = points_to_matches(as_points(depth, "points", np.ones(SIZE)), K, SIZE, SIZE)
-    assert torch.equal(plain.confidence, full.confidence) and plain.plane_step == full.plane_step
-    assert left_out == 0 and torch.equal(plain.confidence[0] > 0, torch.from_numpy(depth > 0))
 
 
 def test_points_outside_are_counted_and_none_left_is_an_error():

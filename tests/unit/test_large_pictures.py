@@ -1,7 +1,5 @@
 """What works through a map in strips says what it says of the whole map; what is thinned keeps its look."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

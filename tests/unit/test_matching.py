@@ -1,7 +1,5 @@
 """Plane sweep, aggregation, left-right check: closed forms on made-up pairs."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -149,13 +147,3 @@ def test_errors_name_the_argument():
             m.build_cost_volume(left, [(texture, K, pose) for pose in poses], K)
     with pytest.raises(ValueError, match="depth_range"):
         m.build_cost_volume(left, [(texture, K, T)], K, depth_range=(3.0, 1.0))
-
-
-def test_blank_images_fall_back_to_the_whole_range():
-    _, (_, K, T), _, _, _ = scene()
-    blank = torch.full((3, *SIZE), 0.5)
-    volume = m.build_cost_volume(blank, [(blank, K, T)], K)
-    whole = pilot_volume(blank, [(blank, K, T)], K)
-    assert volume.inverse_depth[-1] == pytest.approx(float(whole.inverse_depth[-1]), rel=0.02)
-    matches = m.match_volume(volume)
-    assert torch.isfinite(matches.inverse_depth).all() and matches.confidence.mean() < 0.1

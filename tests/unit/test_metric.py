@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -37,8 +35,3 @@ def test_squares_start_at_one_and_clip(space):
     ends = SPACES[space].ends(*depth.flatten(1).unbind(1))
     torch.testing.assert_close(ends, metric.range_of(affine))
     assert torch.autograd.grad(depth.sum(), beyond)[0].abs().max() == 0
-
-
-def test_unknown_space_names_the_known_ones():
-    with pytest.raises(ValueError, match="sqrt_disparity"):
-        MetricMap("inverse")

@@ -1,7 +1,5 @@
 """Priors that are metric by themselves: the search starts from their metres, and the run says how far off."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +10,6 @@ from PIL import Image
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.algorithm import settling
 from geodiff_plugin.algorithm.evidence import prepare_evidence
-from geodiff_plugin.cli.report import summary_line
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.runtime.start import PROMPT_LONG_EDGE, depth_prompt
 from geodiff_plugin.types import CameraView
@@ -51,16 +48,6 @@ def test_a_run_says_how_far_the_priors_metres_were_off(kind, textured_plane):
     assert np.median(out.prediction[0, ..., 0] / textured_plane.depth_m) == pytest.approx(1.0, rel=0.01)
 
 
-def test_the_summary_names_the_factor_of_a_metric_prior_alone(textured_plane):
-    assert guided(knowing("depth_anything", textured_plane.depth_m), textured_plane).own_scale is None
-    depth = {"min_m": 1.0, "median_m": 2.0, "max_m": 3.0, "visible_fraction": 1.0}
-    signs = {"confidence": 0.9, "matched": 0.5, "points": 0}
-    report = {"depth": depth, "seconds": {"all": 1.0}, "own_scale": [[1.2]], "unit": "m"}
-    report["verdict"] = {"status": "trusted", "reasons": [], "signs": signs}
-    assert "prior's own metres x 1.20" in summary_line(report, "out/")
-    assert "own metres" not in summary_line(report | {"own_scale": None}, "out/")
-
-
 @pytest.mark.parametrize("kind", ["tipsv2", "depth_pro"])
 def test_the_search_starts_from_the_priors_own_metres(kind, textured_plane, monkeypatch):
     started, stock = [], settling.search_scale
@@ -76,13 +63,6 @@ def test_the_search_starts_from_the_priors_own_metres(kind, textured_plane, monk
     assert ends[0] == pytest.approx(textured_plane.depth_m.min(), rel=0.08)
     assert ends[1] == pytest.approx(textured_plane.depth_m.max(), rel=0.08)
     assert float(out.own_scale) == pytest.approx(1.0, abs=0.02)
-
-
-def test_where_the_views_say_nothing_the_priors_metres_stand(textured_plane):
-    grey = np.full_like(textured_plane.left, 128)
-    blank = replace(textured_plane, left=grey, right=grey)
-    out = guided(knowing("zoedepth", textured_plane.depth_m), blank)
-    assert float(out.own_scale) == pytest.approx(1.0, abs=1e-3)
 
 
 def evidence_of(pair, points=None, rights=True):
@@ -102,16 +82,6 @@ def test_matches_become_a_dense_prompt(textured_plane):
     assert ((prompt - truth).abs() / truth).median() < 0.015
 
 
-def test_points_alone_become_a_prompt_and_nothing_becomes_none(textured_plane):
-    points = torch.zeros(textured_plane.depth_m.shape)
-    points[::8, ::8] = torch.from_numpy(textured_plane.depth_m)[::8, ::8]
-    evidence = evidence_of(textured_plane, points, rights=False)
-    prompt = depth_prompt([evidence], DEFAULT)
-    middle = float(np.median(textured_plane.depth_m))
-    assert prompt.isfinite().all() and float(prompt.median()) == pytest.approx(middle, rel=0.01)
-    assert depth_prompt([replace(evidence, points=None)], DEFAULT) is None
-
-
 def test_prompt_depth_anything_is_given_what_is_known_unless_it_is_given_depths(textured_plane):
     pipe = knowing("prompt_depth_anything", textured_plane.depth_m)
     out = guided(pipe, textured_plane)
@@ -124,17 +94,6 @@ def test_prompt_depth_anything_is_given_what_is_known_unless_it_is_given_depths(
     assert pipe.own_range[0].tolist() == pytest.approx([7.0, 9.0], abs=0.1)
     with pytest.raises(ValueError, match="prompt_depth"):
         make_transformers("zoedepth")(**call, prompt_depth=own)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
-@pytest.mark.parametrize("varies_m", [0.0, 0.01])
-def test_the_prompt_of_a_wall_far_away_has_a_span(textured_plane, dtype, varies_m):
-    """Of no span at all nothing can be divided, and a centimetre is no step beside 40 m in half precision."""
-    pipe = make_transformers("prompt_depth_anything").to(dtype=dtype)
-    wall_m = 40.0 + varies_m * torch.linspace(0, 1, 24).view(1, 1, 4, 6)
-    out = pipe(Image.fromarray(textured_plane.left), processing_resolution=64, prompt_depth=wall_m)
-    assert np.isfinite(out.prediction).all()
-    assert pipe.own_range.allclose(torch.tensor(40.0), atol=0.1)
 
 
 def test_without_a_length_the_metres_are_those_of_a_metric_prior():

@@ -1,7 +1,5 @@
 """Pictures: colours, legend, contact sheet."""
 
-from __future__ import annotations
-
 import matplotlib
 import numpy as np
 import pytest

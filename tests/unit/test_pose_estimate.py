@@ -1,7 +1,5 @@
 """Photographs without poses: cameras, poses, scale, and what cannot be had."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -11,10 +9,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.formats.lenses import intrinsics_from_exif, intrinsics_from_fov
-from geodiff_plugin.geometry import unproject
-from geodiff_plugin.guidance.photographs import estimate_rig
 from geodiff_plugin.pose.estimate import estimate_pose
 from geodiff_plugin.pose.scale import find_scale
 from geodiff_plugin.pose.solve import MOST_SPREAD, SCALE_PX, Prior, depth_spread, open_pose, solve_poses
@@ -108,21 +103,6 @@ def pair():
     return render_pair(3, size=(240, 320), exposure=True, posed=True)
 
 
-def test_known_points_may_be_a_map_or_carry_an_intensity(pair) -> None:
-    photographs, K = [pair.left.image_01, pair.right.image_01], pair.K_left.numpy()
-    sparse = torch.zeros_like(pair.left.depth_m[0])
-    sparse[4::9, 4::9] = pair.left.depth_m[0, 4::9, 4::9]
-    rows = unproject(sparse[None, None], pair.K_left[None].float()).reshape(-1, 3)
-    rows = rows[rows[:, 2] > 0]
-    rows = torch.cat([rows, torch.ones(len(rows), 1)], 1)  # a lidar's fourth column
-    by_map, by_rows = (estimate_rig(photographs, K=K, points=points).scale for points in (sparse, rows))
-    true = float(np.linalg.norm(pair.E[:3, 3]))
-    assert by_map.source == "points" and by_map.factor == pytest.approx(true, rel=0.1)
-    assert by_rows.factor == pytest.approx(by_map.factor, rel=1e-4)
-    with pytest.raises(ValueError, match="points must be .*shape"):
-        estimate_rig(photographs, K=K, points=rows[:, :2])
-
-
 def as_pil(view) -> Image.Image:
     return Image.fromarray(np.rint(view.image_01.permute(1, 2, 0).numpy() * 255).astype(np.uint8))
 
@@ -141,22 +121,13 @@ def test_photographs_become_a_guidance(pair) -> None:
         guidance.prepare(torch.rand(1, 3, 120, 160))
 
 
-def test_crops_may_lack_their_principal_point(pair) -> None:
-    K = pair.K_left.numpy().copy()
-    K[0, 2] -= 170
-    crops = [view.image_01[..., 170:] for view in (pair.left, pair.right)]
-    with pytest.raises(ValueError, match="principal point .* outside"):
-        GeometryGuidance.from_photographs(crops, baseline_m=0.1, K=K)
-    guidance = GeometryGuidance.from_photographs(crops, baseline_m=0.1, K=K, cropped=True)
-    assert angle_deg(pair.E.numpy()[:3, :3].T @ guidance.rigs[0].E[:3, :3]) < 1.0
-
-
 def test_without_a_length_there_is_no_unit_and_without_K_no_pose(pair) -> None:
     fov = math.degrees(2 * math.atan(160 / float(pair.K_left[0, 0])))
     photographs = as_pil(pair.left), as_pil(pair.right)
     guidance = GeometryGuidance.from_photographs(*photographs, fov=fov)
     assert guidance.unit is None and np.linalg.norm(guidance.rigs[0].E[:3, 3]) == pytest.approx(1.0)
     assert any("no unit" in sentence for sentence in guidance.estimated.warnings)
+    assert open_pose(MOST_SPREAD) == () and "leave the estimated pose open" in open_pose(1.1 * MOST_SPREAD)[0]
     with pytest.raises(ValueError, match="field of view"):
         GeometryGuidance.from_photographs(*photographs, baseline_m=0.1)
 
@@ -184,29 +155,6 @@ def test_the_spread_is_the_scatter_of_depths_over_photographs(poses, noise_px: f
     scatter = float(np.median((inverse / inverse.mean(0)).std(0)))
     said = np.median([depth_spread(tracks, Ts) for tracks, Ts in zip(drawn, solved, strict=True)])
     assert 0.6 * scatter < said < 1.7 * scatter
-
-
-def test_residuals_alike_in_neighbours_make_the_spread_larger_and_the_unit_does_not() -> None:
-    clean, Ts, _ = make_tracks([TRUE], noise_px=0.0, outliers=0.0, count=1500)
-    rng = np.random.default_rng(0)
-    wave = np.sin(clean.left_px / 40.0) * 0.3 * 2**0.5  # of the same size as the noise, but smooth
-    noisy, smooth = (
-        replace(clean, right_px=clean.right_px + by_px) for by_px in (0.3 * rng.normal(size=wave.shape), wave)
-    )
-    alone = depth_spread(noisy, fitted(noisy, Ts))
-    assert depth_spread(smooth, fitted(smooth, Ts)) > 1.5 * alone
-    longer = Ts.copy()
-    longer[:, :3, 3] *= 1000.0
-    assert depth_spread(noisy, longer) == pytest.approx(depth_spread(noisy, Ts), rel=1e-3)
-
-
-def test_photographs_whose_matches_leave_the_pose_open() -> None:
-    """A rendered corridor with little texture: its depths are off by a quarter, and that is said."""
-    sample = load(find_pairs("synthetic-posed:1+9")[0])
-    baseline_m = float(np.linalg.norm(sample.E[:3, 3]))
-    rig = estimate_rig([sample.left, sample.right], K=(sample.K_left, sample.K_right), baseline_m=baseline_m)
-    assert rig.depth_spread > MOST_SPREAD and open_pose(MOST_SPREAD) == ()
-    assert any("leave the estimated pose open" in sentence for sentence in rig.warnings)
 
 
 def with_exif(size, focal35=None, taken=None) -> Image.Image:

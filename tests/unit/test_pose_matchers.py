@@ -1,7 +1,5 @@
 """Learned matchers by name: tiny random ones of transformers' own classes, and what cannot be had."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Poses as given against matches: residuals, refinement, straightening, the usual mistakes."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 
@@ -23,7 +21,6 @@ from geodiff_plugin.pose.tracks import (
     median_residuals,
     residuals_px,
     solve_inverse_depth,
-    split_residuals,
 )
 from geodiff_plugin.types import CameraView
 from tests.scenes import render_pair
@@ -113,18 +110,6 @@ def test_a_shift_that_makes_up_for_a_turn_comes_back() -> None:
     assert undecided(tracks, Ts, Ts) == ()
     other = np.linalg.inv(TRUE @ pose((0.0, 1.0, 0.0), (0, 0, 0)))[None]
     assert "do not settle the pose" in undecided(tracks, Ts, other)[0]
-
-
-def test_cameras_with_faults_of_their_own_do_not_move_a_pose() -> None:
-    """What a lens or a shutter does looks like a turn in part; a free pose takes it and spoils depth."""
-    clean, Ts, depth_m = make_tracks([TRUE], outliers=0.0)
-    x, y = (clean.right_px / np.array([511.0, 383.0]) - 0.5).transpose(2, 0, 1)
-    tracks = replace(
-        clean, right_px=clean.right_px + np.stack([0 * x, 8.0 * x * y + np.sin(9.0 * y)], axis=-1)
-    )
-    free = solve_poses(tracks, Ts, Prior(np.array([1e3])))
-    assert depth_error(tracks, settled(tracks, Ts), depth_m) < 0.01
-    assert depth_error(tracks, free, depth_m) > 0.1
 
 
 def test_the_refinement_is_joint_and_reaches_the_optimum() -> None:
@@ -231,14 +216,6 @@ def test_a_smooth_residual_is_straightened_and_pixels_move_where_matches_go() ->
     ramp = torch.arange(SIZE[0], dtype=torch.float32).view(1, -1, 1).expand(3, *SIZE) / 1000
     moved = straightened(ramp, displacement)[0, 200, 500] * 1000
     assert moved == pytest.approx(200 - displacement.at(np.array([[500.0, 200.0]]))[0, 1], abs=0.05)
-
-
-def test_what_neighbours_have_in_common_is_told_from_noise() -> None:
-    tracks, Ts, _ = make_tracks([TRUE], noise_px=0.4, outliers=0.0)
-    alone, alike = split_residuals(tracks, Ts[0]), split_residuals(bent(tracks, 2.0), Ts[0])
-    assert alone[0] > 0.5 > 0.2 > alike[0] and alone[1] < 0.1 < 0.4 < alike[1]
-    # Too few blocks to tell: all of it may be common.
-    assert split_residuals(tracks.kept(slice(12)), Ts[0])[1] > 0.2
 
 
 @pytest.fixture(scope="module")

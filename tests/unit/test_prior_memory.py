@@ -1,28 +1,12 @@
 """Memory is counted by running fake tensors; on tiny networks it can be checked."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
 from geodiff_plugin.priors import PRIORS
 from tests.benchmarks.full_sizes import FULL_SIZES
-from tests.benchmarks.memory import _LiveBytes, count_memory
+from tests.benchmarks.memory import count_memory
 from tests.contracts.tiny_priors import TINY
-
-
-def test_live_bytes_rise_and_fall():
-    with _LiveBytes() as counted:
-        a = torch.zeros(1000)
-        b = a + 1  # a and b together: the peak
-        assert counted.live == 8000
-        del a
-        assert counted.live == 4000
-        c = b.view(10, 100)  # no storage of its own
-        del b
-        assert counted.live == 4000
-        del c
-    assert (counted.live, counted.peak) == (0, 8000)
 
 
 @pytest.mark.parametrize("key", [pytest.param("marigold", marks=pytest.mark.slow), "depthmaster"])

@@ -3,8 +3,6 @@
 ``python -m tests.unit.test_prior_outputs`` stores them anew.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

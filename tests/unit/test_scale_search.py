@@ -1,13 +1,10 @@
 """The search for metres, on made-up pairs with a known answer."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
 from geodiff_plugin import matching as m
-from geodiff_plugin.scale.points import fit_to_points, refine_to_matches, reliable_matches
-from geodiff_plugin.scale.space import MetricMap
+from geodiff_plugin.scale.points import refine_to_matches
 from geodiff_plugin.scale.volume_search import search_scale
 from tests.benchmarks.matching import textured_pair
 
@@ -55,17 +52,6 @@ def test_true_relative_map_gives_the_true_metres(scene, space):
     assert 0 <= found.cost < 0.15
 
 
-def test_current_state_stays_unless_something_better_shows_up(scene):
-    volume, depth = scene
-    x = relative(depth, "depth")
-    found = search_scale(volume, x, "depth")
-    ends = (found.near_m, found.far_m)
-    again = search_scale(volume, x, "depth", current=ends)
-    assert torch.equal(again.near_m, found.near_m) and torch.equal(again.far_m, found.far_m)
-    wrong = search_scale(volume, x, "depth", current=tuple(3.0 * end for end in ends))
-    assert float(wrong.near_m) == pytest.approx(float(found.near_m), rel=1e-4)
-
-
 @pytest.mark.parametrize("space", SPACES)
 def test_refinement_finds_the_truth_among_outliers(scene, space):
     volume, depth = scene
@@ -95,16 +81,3 @@ def test_noise_of_far_matches_does_not_pull_the_far_end_nearer(seed):
     near, far = refine_to_matches(x, matches, nearest * 1.05, farthest * 0.8, "disparity")
     assert float(near) == pytest.approx(float(nearest), rel=0.02)
     assert float(far) == pytest.approx(float(farthest), rel=0.1)
-
-
-def test_a_wrong_basin_is_left_and_a_right_one_kept():
-    """Of a road, with a relative map of it that errs by 15 %."""
-    x = torch.linspace(0.0, 1.0, STREET[0]).view(1, -1, 1).expand(1, *STREET)
-    inverse = 1 / 80 + (1 / 6 - 1 / 80) * x
-    noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(0))
-    x, metric = (x * torch.exp(0.15 * noise)).clamp(0, 1)[None], MetricMap("disparity")
-    reliable = reliable_matches(m.Matches(inverse, torch.full_like(inverse, 0.9), torch.tensor(2e-3)))
-    near, far = fit_to_points(x, reliable, metric, (torch.tensor([42.0]), torch.tensor([84.0])))
-    assert near.item() == pytest.approx(6.0, rel=0.3) and far.item() > 40.0
-    kept = fit_to_points(x, reliable, metric, (torch.tensor([6.0]), torch.tensor([80.0])))
-    assert [v.item() for v in kept] == pytest.approx([6.0, 80.0])

@@ -1,13 +1,9 @@
 """What happens at each step of a guided call: left alone, corrected, updated, skipped."""
 
-from __future__ import annotations
-
 import pytest
 
-from geodiff_plugin.algorithm.schedule import Round, count_steps, make_schedule
-from geodiff_plugin.config import DEFAULT, PAPER, SEARCH_ONLY
-
-CORRECT, SETTLE = Round(True, 0), Round(False, 0)
+from geodiff_plugin.algorithm.schedule import count_steps, make_schedule
+from geodiff_plugin.config import DEFAULT, SEARCH_ONLY
 
 
 def schedule(steps, config=DEFAULT, **options):
@@ -29,25 +25,6 @@ def schedule(steps, config=DEFAULT, **options):
 def test_corrections_are_spread_over_the_second_half_of_what_is_active(steps, corrections, knobs, corrected):
     found = schedule(steps, DEFAULT.changed(corrections=corrections, **knobs)).steps
     assert [i for i, rounds in enumerate(found) if any(r.corrects for r in rounds)] == corrected
-
-
-@pytest.mark.parametrize(
-    ("steps", "config", "options", "expected"),
-    [
-        *(
-            (4, DEFAULT.changed(inner_steps=0, **knobs), {}, ((), (), (), (SETTLE,)))
-            for knobs in ({"correct": False}, {"optimize_latents": False}, {"start": 1.0})
-        ),
-        (4, DEFAULT, {"encodes": False}, ((), (), (), (SETTLE,))),
-        (3, PAPER, {}, ((Round(False, 1),),) * 3),
-        (4, DEFAULT.changed(inner_steps=3), {}, ((), (), (CORRECT,), (Round(True, 3),))),
-        (1, DEFAULT, {"rounds": 4}, ((CORRECT,),)),
-        (1, DEFAULT.changed(inner_steps=2, correct=False), {"rounds": 4}, ((Round(False, 2),) * 4,)),
-        (3, DEFAULT, {"skipped": 1}, schedule(4).steps[1:]),
-    ],
-)
-def test_the_rounds_of_every_step(steps, config, options, expected):
-    assert schedule(steps, config, **options).steps == expected
 
 
 def test_it_prints_what_happens():

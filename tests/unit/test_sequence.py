@@ -1,14 +1,12 @@
 """Rendered sequences, their flicker, and calls that go on from the frame before."""
 
-from __future__ import annotations
-
 import copy
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from diffusers import DDIMScheduler, LCMScheduler
+from diffusers import DDIMScheduler
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError, InputTypeError
@@ -18,7 +16,6 @@ from geodiff_plugin.evaluation.options import SequenceOptions
 from geodiff_plugin.priors import find_adapter
 from geodiff_plugin.runtime.start import plan_warm_start
 from geodiff_plugin.types import MetricDepthOutput
-from tests.contracts.tiny_priors import make_geowizard
 from tests.scenes import render_sequence
 
 
@@ -123,12 +120,6 @@ def test_its_scale_is_that_of_the_frame_before(pipe, textured_plane, first):
     torch.testing.assert_close(in_baselines.far_m, plain.far_m)
 
 
-def test_another_scheduler_takes_over_the_scale_alone(make_pipeline, textured_plane):
-    scheduler = LCMScheduler.from_config(make_pipeline().scheduler.config)
-    pipe = enable_geometry_guidance(make_pipeline(scheduler))
-    assert len(call(pipe, textured_plane, call(pipe, textured_plane)).history) == 4
-
-
 def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane, first):
     def changed(**entries):
         other = copy.copy(first)
@@ -153,15 +144,3 @@ def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane, first):
     guidance = GeometryGuidance([pair.right] * 2, pair.K, pair.E, previous=members)
     with pytest.raises(InputError, match="previous must be the output of 2 images of 1 member"):
         pipe([pair.left] * 2, guidance=guidance)
-
-
-def test_depth_and_normals_start_from_one_noise(textured_plane):
-    """As in GeoWizard's own call."""
-    pipe = enable_geometry_guidance(make_geowizard())
-    first = call(pipe, textured_plane)
-    factor = pipe.image_processor.config.vae_scale_factor
-    size = tuple(side * factor for side in first.latent.shape[-2:])
-    warm = planned(pipe, guided(textured_plane, first), size)
-    alpha_bar = pipe.scheduler.alphas_cumprod[int(first.history[warm.skipped].timestep)]
-    depth, normals = (warm.latents - alpha_bar.sqrt() * first.latent).chunk(2, dim=1)
-    torch.testing.assert_close(depth, normals, rtol=0, atol=1e-4)

@@ -1,7 +1,5 @@
 """A skew ``K[0, 1]`` is obeyed by every function that reads a camera matrix."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -10,16 +8,14 @@ from geodiff_plugin import GeometryGuidance, geometry
 from geodiff_plugin._camera_checks import check_intrinsics, check_size_of
 from geodiff_plugin.algorithm.evidence import prepare_evidence
 from geodiff_plugin.config import GuidanceConfig
-from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity, disparity_to_depth
 from geodiff_plugin.evaluation.figures import render_cloud
 from geodiff_plugin.formats.clouds import write_ply
 from geodiff_plugin.matching import build_cost_volume, match_volume, points_to_matches
-from geodiff_plugin.matching.alignment import align_view
 from geodiff_plugin.matching.build import mirrored_pose_preferred, pilot_volume, to_grid
 from geodiff_plugin.matching.sweep import sweep_planes
 from geodiff_plugin.types import CameraView
 from tests.conftest import textured
-from tests.unit.test_geometry import pixels, points_of, tensor, uv_of
+from tests.unit.test_geometry import points_of, tensor
 
 SIZE = (48, 64)
 K = np.array([[60.0, 14.0, 28.5], [0.0, 55.0, 24.5], [0.0, 0.0, 1.0]])
@@ -36,16 +32,6 @@ def test_shrinking_keeps_the_skew_of_the_image():
     twice = tensor(K)[0] * torch.tensor([2.0, 2.0, 1.0]).view(3, 1)
     small, K_small = geometry.as_fine_as(image, twice, tensor(K)[0])
     assert small.shape[-2:] == (24, 32) and float(K_small[0, 1] / K_small[0, 0]) == pytest.approx(14 / 60)
-
-
-def test_with_equal_skews_a_shift_along_the_row_says_everything():
-    pose = np.eye(4)
-    pose[0, 3] = -0.1
-    E = np.linalg.inv(pose)
-    shift = depth_to_disparity(DEPTH, K, K, E)
-    expected = pixels(SIZE)[0] - uv_of(points_of(DEPTH, K) + pose[:3, 3, None, None], K)[0]
-    np.testing.assert_allclose(shift, expected, atol=1e-9)
-    np.testing.assert_allclose(disparity_to_depth(shift, K, K, E), DEPTH, rtol=1e-6)
 
 
 def test_the_sweep_and_all_that_is_made_of_it():
@@ -75,18 +61,6 @@ def test_the_sweep_and_all_that_is_made_of_it():
     assert not mirrored_pose_preferred(left, rights, camera)
     small = geometry.resize_intrinsics(tensor(K), SIZE, (36, 48))[0]
     np.testing.assert_allclose(evidence.K_left, small, rtol=1e-6)
-
-
-def test_a_plane_seen_from_above_moves_along_the_skewed_rows():
-    above = torch.eye(4, dtype=torch.float64)
-    above[:3, 3] = torch.tensor([-0.1, 0.15, 0.0])
-    view = align_view(
-        (torch.rand(1, *SIZE), tensor(K)[0], above), tensor(K)[0], SIZE, torch.tensor([0.2, 0.5])
-    )
-    for k, depth_m in enumerate((5.0, 2.0)):
-        expected = uv_of(points_of(np.full(SIZE, depth_m), K) + above[:3, 3, None, None].numpy(), K)
-        np.testing.assert_allclose(view.positions(SIZE[1], 0)[k], expected[0, 0], atol=1e-3)
-        np.testing.assert_allclose(view.positions(SIZE[0], 1)[k], expected[1, :, 0], atol=1e-3)
 
 
 def test_points_and_clouds(tmp_path):

@@ -1,7 +1,5 @@
 """The smooth field of a weighted least-squares problem: exact where it can be checked, whatever the size."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

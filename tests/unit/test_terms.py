@@ -1,7 +1,5 @@
 """Guidance terms against their formulas in NumPy, and the photometric one against what it must not see."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -74,16 +72,3 @@ def test_photometric_ignores_what_is_not_visible():
     masked = photometric(estimate(warped_01=warped, visible=seen, config=FLAT))
     torch.testing.assert_close(masked, torch.zeros_like(masked), atol=1e-5, rtol=0)
     assert (photometric(estimate(warped_01=warped, config=FLAT)) > 0.1).all()
-
-
-def test_photometric_takes_the_view_that_explains_a_pixel_best():
-    left = estimate().left_01
-    first, second = left.clone(), torch.zeros_like(left)
-    first[..., 20:], second[..., 20:] = 0.0, left[..., 20:]
-    seen = torch.ones(2, 2, 1, *SIZE, dtype=torch.bool)
-    both = estimate(warped_01=torch.stack([first, second], 1), visible=seen, config=FLAT)
-    assert (photometric(both) < 0.03).all()  # SSIM looks one pixel across the seam
-    alone, hidden = photometric(estimate(warped_01=first[:, None])), seen.clone()
-    hidden[:, 1] = False
-    assert (alone > 0.2).all()
-    torch.testing.assert_close(photometric(estimate(warped_01=both.warped_01, visible=hidden)), alone)

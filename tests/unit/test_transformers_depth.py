@@ -1,7 +1,5 @@
 """Depth models of ``transformers``: what each class says, how its map lies on the image, and its folders."""
 
-from __future__ import annotations
-
 import json
 from types import SimpleNamespace
 
@@ -15,12 +13,10 @@ from geodiff_plugin.priors import find_adapter, find_prior, load_prior
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.transformers_depth import (
     NO_DEPTH,
-    Preparation,
     TransformersDepthPipeline,
     output_of,
-    unit_range,
 )
-from tests.contracts.tiny_transformers import MODELS, depth_anything, make_transformers
+from tests.contracts.tiny_transformers import MODELS, make_transformers
 
 OUTPUTS = {
     "depth_anything": ("disparity", False),
@@ -114,13 +110,6 @@ def test_every_class_of_the_library_is_guided_or_refused(tmp_path):
         load_prior(tmp_path)
 
 
-def test_configs_change_what_a_class_predicts():
-    pro, dpt = MODELS["depth_pro"]()[0], MODELS["dpt"]()[0]
-    pro.config.use_fov_model, dpt.config.add_projection = False, True
-    assert output_of(pro) == ("disparity", False)
-    assert output_of(dpt) == output_of(depth_anything("metric")[0]) == ("depth", True)
-
-
 def test_a_space_that_the_user_says_wins_and_an_unknown_class_needs_one():
     assert echo("GLPN").config.prediction_type == "depth"
     said = echo("GLPN", "disparity", MODELS["glpn"]()[0])
@@ -136,28 +125,6 @@ def test_depth_pro_gives_inverse_metres_by_its_own_field_of_view():
     values = pipe.predict(torch.full((1, 3, 16, 16), 0.25), (16, 16))
     torch.testing.assert_close(values, torch.full_like(values, 0.5))
     torch.testing.assert_close(pipe.metres(values), torch.full_like(values, 2.0))
-
-
-def test_unit_range_keeps_the_low_end_and_is_not_led_by_a_stray_pixel():
-    values = torch.linspace(3, 5, 1000).view(1, 1, 20, 50).clone()
-    values[0, 0, -1, -1] = 1e6
-    ranged = unit_range(values)
-    assert ranged.min() == 0 and 0.97 < ranged.flatten()[:-1].max() < 1.05
-    assert (unit_range(torch.full((1, 1, 4, 4), 7.0)) == 0).all()
-
-
-@pytest.mark.parametrize(
-    ("config", "sentence"),
-    [
-        ({"image_processor_type": "CLIPImageProcessor"}, "image_processor_type"),
-        ({"image_processor_type": "GLPNImageProcessor", "resample": 0}, "resample"),
-        ({"image_processor_type": "DPTImageProcessor", "size": {"shortest_edge": 9}}, "size"),
-        ({"image_processor_type": "GLPNImageProcessor"}, "patch"),
-    ],
-)
-def test_processors_and_images_that_do_not_fit_are_refused(config, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        Preparation(config)(torch.zeros(1, 3, 20, 90))
 
 
 def test_missing_weights_are_listed_but_for_those_that_nothing_reads(tmp_path):

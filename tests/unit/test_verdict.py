@@ -1,7 +1,5 @@
 """What is wrong is named; what is right is left in peace."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings
@@ -9,12 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.runtime.verdict import Indicators, judge, points_agreement
-from geodiff_plugin.scale.points import order_agreement
+from geodiff_plugin.runtime.verdict import Indicators, judge
 from tests.scenes import render_pair
 
 GOOD = Indicators(confidence=0.85, matched=0.8, order=0.8, spread=0.7, baseline_m=0.12, view_deg=60.0)
@@ -84,23 +80,6 @@ def test_reasons(signs, words):
 def test_remarks(signs, words):
     verdict = judge(replace(GOOD, **signs))
     assert verdict.trusted and any(words in remark for remark in verdict.remarks)
-
-
-def test_confidence_falls_with_disagreement():
-    factors = [points_agreement(replace(GOOD, points_ratio=r)) for r in (1.0, 1.05, 1.12, 1.2, 3.0, 1 / 3)]
-    assert factors[:2] == [1.0, 1.0] and factors[3:] == pytest.approx([0.25] * 3)
-    assert 0.25 < factors[2] < 1.0 and points_agreement(GOOD) == 1.0
-
-
-def test_rank_correlation(textured_plane):
-    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E)
-    left = torch.from_numpy(textured_plane.left).permute(2, 0, 1)[None].float() / 255
-    (evidence,) = guidance.prepare(left)
-    depth = torch.from_numpy(textured_plane.depth_m)[None, None]
-    assert float(order_agreement(1 / depth, evidence.matches, "disparity")) > 0.9
-    assert float(order_agreement(-depth, evidence.matches, "depth")) < -0.9
-    nothing = replace(evidence.matches, confidence=torch.zeros_like(evidence.matches.confidence))
-    assert order_agreement(depth, nothing, "depth").isnan().all()
 
 
 @pytest.fixture(scope="module")
