@@ -1,6 +1,7 @@
 """Many pairs in one run: folders, lists and videos; overlap, resumption, failures, several processes."""
 
 import csv
+import errno
 import json
 import os
 import shutil

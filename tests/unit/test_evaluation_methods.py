@@ -19,7 +19,8 @@ from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.types import Rig
 from tests.contracts.tiny_transformers import MODELS, make_transformers
 
-SHAPE, NAN = (32, 48), float("nan")
+
+SHAPE = (32, 48)
 
 
 def plane_sample(pair, E=None) -> StereoSample:

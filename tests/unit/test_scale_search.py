@@ -16,7 +16,7 @@ SPACES = {
     "log1p": (torch.log1p, torch.expm1),
     "sqrt_disparity": (lambda z: z**-0.5, lambda v: v**-2),
 }
-SIZE, STREET = (96, 144), (40, 60)
+SIZE = (96, 144)
 
 
 def relative(depth: torch.Tensor, space: str, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
