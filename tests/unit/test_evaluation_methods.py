@@ -19,7 +19,6 @@ from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.types import Rig
 from tests.contracts.tiny_transformers import MODELS, make_transformers
 
-
 SHAPE = (32, 48)
 
 

@@ -107,7 +107,7 @@ def test_points_of_either_form():
         ({"left_size": "64x48"}, TypeError, "left_size must be"),
         ({"unit": "mm"}, ValueError, "unit must be 'm' or None"),
         ({"config": {"gradient": "full"}}, TypeError, "config must be a GuidanceConfig"),
-        ({"preset": "fast"}, ValueError, "preset must be one of default"),
+        ({"preset": "best"}, ValueError, "preset must be one of default"),
         ({"preset": "paper", "config": PAPER}, ValueError, "preset must be None beside config"),
         ({"search": "one-number", "weights": {"matches": 1.0}}, ValueError, "photometric weight"),
         ({"search": "points-range"}, ValueError, "'points-range' needs points"),
