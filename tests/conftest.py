@@ -1,9 +1,10 @@
 """Fixtures: a tiny random Marigold, and a pair of analytic renderings of a tilted, textured plane."""
 
-import json
 import os
 from dataclasses import dataclass
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from diffusers.configuration_utils import ConfigMixin, register_to_config
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
 import tests.scenes.dataset  # noqa: F401  registers the data set synthetic:N
+from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 
 # Networks and images are tiny here: a second thread costs more than it brings, above all where several
 # processes share the cores. Processes that a test starts read the variable.
@@ -68,34 +70,56 @@ def make_text_encoder(seed: int = 2) -> CLIPTextModel:
     return CLIPTextModel(CLIPTextConfig(**size, vocab_size=4))
 
 
-@pytest.fixture(scope="session")
-def tokenizer(tmp_path_factory) -> CLIPTokenizer:
-    folder = tmp_path_factory.mktemp("tokenizer")
-    vocab = {"<|startoftext|>": 0, "<|endoftext|>": 1, "a</w>": 2, "a": 3}
-    (folder / "vocab.json").write_text(json.dumps(vocab))
-    (folder / "merges.txt").write_text("#version: 0.2\n")
-    return CLIPTokenizer(str(folder / "vocab.json"), str(folder / "merges.txt"), model_max_length=77)
+def make_tokenizer(letters: str = "a") -> CLIPTokenizer:
+    """Of the empty prompt and some letters."""
+    tokens = ["<|startoftext|>", "<|endoftext|>"]
+    tokens += ["a</w>", "a"] if letters == "a" else [*letters, *(letter + "</w>" for letter in letters)]
+    return CLIPTokenizer(vocab={t: i for i, t in enumerate(tokens)}, merges=[], model_max_length=77)
+
+
+def quiet(pipe: Any) -> Any:
+    """Without progress bars."""
+    pipe.set_progress_bar_config(disable=True)
+    return pipe
+
+
+def make_marigold(scheduler=None, **config) -> MarigoldDepthPipeline:
+    """Marigold v1-1's schedule, two steps."""
+    networks = make_unet().eval(), make_vae().eval(), scheduler or DDIMScheduler(**SCHEDULER)
+    config = {"default_denoising_steps": 2, "default_processing_resolution": 64} | config
+    text = make_text_encoder().eval(), make_tokenizer()
+    return quiet(MarigoldDepthPipeline(*networks, *text, **{"prediction_type": "depth"} | config))
 
 
 @pytest.fixture(scope="session")
-def make_pipeline(tokenizer):
+def make_pipeline():
     """Factory of tiny random Marigold pipelines; the same seed gives the same weights."""
+    return make_marigold
 
-    def make(scheduler=None, prediction_type: str = "depth") -> MarigoldDepthPipeline:
-        pipe = MarigoldDepthPipeline(
-            unet=make_unet(),
-            vae=make_vae(),
-            scheduler=scheduler or DDIMScheduler(**SCHEDULER),
-            text_encoder=make_text_encoder(),
-            tokenizer=tokenizer,
-            prediction_type=prediction_type,
-            default_denoising_steps=2,
-            default_processing_resolution=64,
-        )
-        pipe.set_progress_bar_config(disable=True)
-        return pipe
 
-    return make
+@pytest.fixture
+def pipe() -> MarigoldDepthPipeline:
+    return enable_geometry_guidance(make_marigold())
+
+
+@pytest.fixture(scope="session")
+def prior(tmp_path_factory) -> Path:
+    """Folder of a tiny random Marigold."""
+    folder = tmp_path_factory.mktemp("prior")
+    make_marigold().save_pretrained(folder)
+    return folder
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def guided_call(pipe, pair, knobs=(), **call):
+    """The output of a seeded call on a pair, guided by ``knobs`` or by a guidance that is made."""
+    if not isinstance(knobs, GeometryGuidance):
+        knobs = GeometryGuidance(pair.right, pair.K, pair.E, **dict(knobs))
+    drawn = {} if "latents" in call else {"generator": seeded()}
+    return enable_geometry_guidance(pipe)(pair.left, guidance=knobs, **drawn | call)
 
 
 @dataclass(frozen=True)
@@ -178,31 +202,15 @@ class OracleUNet(ModelMixin, ConfigMixin):
 
 
 @pytest.fixture
-def make_oracle(tokenizer):
+def make_oracle():
     """Factory of a Marigold whose denoiser knows the relative depth ``(H, W)`` up to an affine map."""
 
     def make(relative: np.ndarray, prediction_type: str = "depth") -> MarigoldDepthPipeline:
         unet = OracleUNet()
         unet.relative = torch.from_numpy(relative)[None, None].float()
-        scheduler = DDIMScheduler(
-            **{
-                **SCHEDULER,
-                "prediction_type": "sample",
-                "rescale_betas_zero_snr": False,
-                "set_alpha_to_one": True,
-            }
-        )
-        pipe = MarigoldDepthPipeline(
-            unet=unet,
-            vae=OracleVAE(),
-            scheduler=scheduler,
-            text_encoder=make_text_encoder(),
-            tokenizer=tokenizer,
-            prediction_type=prediction_type,
-            default_denoising_steps=2,
-            default_processing_resolution=0,
-        )
-        pipe.set_progress_bar_config(disable=True)
-        return pipe
+        clean = {"prediction_type": "sample", "rescale_betas_zero_snr": False, "set_alpha_to_one": True}
+        parts = unet, OracleVAE(), DDIMScheduler(**SCHEDULER | clean), make_text_encoder(), make_tokenizer()
+        told = {"default_denoising_steps": 2, "default_processing_resolution": 0}
+        return quiet(MarigoldDepthPipeline(*parts, prediction_type=prediction_type, **told))
 
     return make

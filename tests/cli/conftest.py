@@ -59,14 +59,6 @@ def write_pair(folder: Path, pair) -> PairFiles:
     return files
 
 
-@pytest.fixture(scope="session")
-def prior(make_pipeline, tmp_path_factory) -> Path:
-    """Folder of a tiny random Marigold."""
-    folder = tmp_path_factory.mktemp("prior")
-    make_pipeline().save_pretrained(folder)
-    return folder
-
-
 @pytest.fixture
 def pair_files(tmp_path, textured_plane, monkeypatch) -> PairFiles:
     """The pair in a fresh folder, which is also the working directory."""

@@ -17,7 +17,7 @@ from geodiff_plugin.priors import find_prior, load_prior
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
 from geodiff_plugin.priors.ppd import PixelDiT
-from tests.conftest import make_text_encoder, make_vae
+from tests.conftest import make_text_encoder, make_tokenizer, make_vae
 from tests.contracts.tiny_priors import make_ppd
 from tests.parity import marigold_v2_reference as reference
 from tests.parity.depthfm_reference import HPARAMS, VAE
@@ -124,11 +124,11 @@ def test_a_vae_that_is_not_there_and_a_torn_file(convert, geodiff, checkpoint, t
 # Folders of .bin files -----------------------------------------------------------------------------------
 
 
-def test_a_folder_of_bin_files(geodiff, tmp_path, tokenizer):
+def test_a_folder_of_bin_files(geodiff, tmp_path):
     """As DepthMaster's trainer writes them; index without a scheduler and with the authors' class names."""
     source = tmp_path / "theirs"
     unet = fill(FourierUNet(**UNET | {"cross_attention_dim": 8, "block_out_channels": (32, 32)}))
-    DepthMasterPipeline(unet, make_vae(), make_text_encoder(), tokenizer).save_pretrained(source)
+    DepthMasterPipeline(unet, make_vae(), make_text_encoder(), make_tokenizer()).save_pretrained(source)
     index = json.loads((source / "model_index.json").read_text())
     index["unet"] = ["depthmaster.modules.unet_2d_condition_s2", "UNet2DConditionModel"]
     del index["prediction_type"], index["default_denoising_steps"]

@@ -4,7 +4,6 @@ Weights are drawn by a seed, images processed at 64 pixels; every function makes
 """
 
 import string
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,13 +12,11 @@ from diffusers import (
     DDIMScheduler,
     DiffusionPipeline,
     FlowMatchEulerDiscreteScheduler,
-    MarigoldDepthPipeline,
     UNet2DConditionModel,
 )
 from transformers import (
     CLIPTextConfig,
     CLIPTextModel,
-    CLIPTokenizer,
     CLIPVisionConfig,
     CLIPVisionModelWithProjection,
     Dinov2Config,
@@ -36,7 +33,15 @@ from geodiff_plugin.priors.geowizard import IMAGE_EMBEDDING, TEXT_PROMPT, GeoWiz
 from geodiff_plugin.priors.lotus import LotusPipeline
 from geodiff_plugin.priors.marigold import E2EFTPipeline
 from geodiff_plugin.priors.ppd import PixelDiT, PPDPipeline
-from tests.conftest import SCHEDULER, make_text_encoder, make_unet, make_vae
+from tests.conftest import (
+    SCHEDULER,
+    make_marigold,
+    make_text_encoder,
+    make_tokenizer,
+    make_unet,
+    make_vae,
+    quiet,
+)
 from tests.contracts.tiny_transformers import make_transformers
 from tests.parity import depthfm_reference, depthmaster_reference, geowizard_reference, lotus_reference
 
@@ -45,38 +50,11 @@ TINY_VAE = {"block_out_channels": (8,) * 4, "norm_num_groups": 4}
 AT_64 = {"default_processing_resolution": 64}
 
 
-def make_tokenizer(letters: str = "a") -> CLIPTokenizer:
-    """Of the empty prompt and some letters."""
-    tokens = ["<|startoftext|>", "<|endoftext|>"]
-    tokens += ["a</w>", "a"] if letters == "a" else [*letters, *(letter + "</w>" for letter in letters)]
-    return CLIPTokenizer(vocab={t: i for i, t in enumerate(tokens)}, merges=[], model_max_length=77)
-
-
-def quiet(pipe: Any) -> Any:
-    """Without progress bars."""
-    pipe.set_progress_bar_config(disable=True)
-    return pipe
-
-
-def _marigold_parts() -> dict[str, Any]:
-    networks = {
-        "unet": make_unet().eval(),
-        "vae": make_vae().eval(),
-        "text_encoder": make_text_encoder().eval(),
-    }
-    return {**networks, "tokenizer": make_tokenizer(), "prediction_type": "depth", **AT_64}
-
-
-def make_marigold() -> MarigoldDepthPipeline:
-    """Marigold v1-1's schedule, two steps."""
-    scheduler = DDIMScheduler(**SCHEDULER)
-    return quiet(MarigoldDepthPipeline(**_marigold_parts(), scheduler=scheduler, default_denoising_steps=2))
-
-
 def make_e2e_ft() -> E2EFTPipeline:
-    """The same networks, one step from zeros."""
+    """Marigold's networks, one step from zeros."""
     scheduler = DDIMScheduler(**SCHEDULER | {"rescale_betas_zero_snr": False})
-    return quiet(E2EFTPipeline(**_marigold_parts(), scheduler=scheduler))
+    parts = make_unet().eval(), make_vae().eval(), scheduler, make_text_encoder().eval(), make_tokenizer()
+    return quiet(E2EFTPipeline(*parts, prediction_type="depth", **AT_64))
 
 
 def make_depthfm(noising_step: int = 400) -> DepthFMPipeline:

@@ -20,38 +20,29 @@ from PIL import Image
 from geodiff_plugin import (
     GeometryGuidance,
     GuidedMarigoldDepthPipeline,
-    InputError,
     disable_geometry_guidance,
     enable_geometry_guidance,
 )
 from geodiff_plugin.runtime.run import GuidedRun
-from tests.conftest import SCHEDULER, plane_pair
+from tests.conftest import SCHEDULER, guided_call, plane_pair, quiet, seeded
 
 FAST = {"inner_steps": 2, "min_steps": 1, "sweep_pixels": 64 * 48}
 PHOTOMETRIC = {"photometric": 1.0}  # alone: matches would also correct the map
+FULL = {"gradient": "full"}
 BOTH_GRADIENTS = pytest.mark.parametrize("gradient", ["denoised", "full"])
 
 
-def seeded():
-    return torch.Generator().manual_seed(0)
-
-
-def stock(pipe, image, **kwargs):
-    return pipe(image, generator=seeded(), output_latent=True, **kwargs)
-
-
 class Guided:
-    """A tiny pipeline, and guided calls of it on a pair: knobs of the guidance, keywords of the call."""
+    """A tiny pipeline with guided calls of few updates on a pair, and its stock call."""
 
     def __init__(self, pipe, pair):
-        self.pipe, self.pair, self.left = enable_geometry_guidance(pipe), pair, Image.fromarray(pair.left)
+        self.pipe, self.pair = enable_geometry_guidance(pipe), pair
 
-    def __call__(self, guidance=None, image=None, /, **call):
-        if not isinstance(guidance, GeometryGuidance):
-            knobs = FAST | (guidance or {})
-            guidance = GeometryGuidance(self.pair.right, self.pair.K, self.pair.E, **knobs)
-        drawn = {} if "latents" in call else {"generator": seeded()}
-        return self.pipe(self.left if image is None else image, guidance=guidance, **(drawn | call))
+    def __call__(self, knobs=None, **call):
+        return guided_call(self.pipe, self.pair, FAST | (knobs or {}), **call)
+
+    def stock(self, **call):
+        return self.pipe(self.pair.left, generator=seeded(), output_latent=True, **call)
 
 
 @pytest.fixture
@@ -59,32 +50,16 @@ def guided(make_pipeline, textured_plane):
     return Guided(make_pipeline(), textured_plane)
 
 
-@pytest.fixture
-def left(textured_plane):
-    return Image.fromarray(textured_plane.left)
-
-
 def assert_same(a, b):
     np.testing.assert_array_equal(a.prediction, b.prediction)
     assert torch.equal(a.latent, b.latent)
-
-
-def test_without_guidance_it_is_the_stock_call(make_pipeline, left):
-    reference = stock(make_pipeline(), left, ensemble_size=3, batch_size=2)
-    pipe = make_pipeline()
-    cls = type(pipe)
-    assert enable_geometry_guidance(enable_geometry_guidance(pipe)) is pipe and isinstance(pipe, cls)
-    assert_same(stock(pipe, left, ensemble_size=3, batch_size=2), reference)
-    disable_geometry_guidance(disable_geometry_guidance(pipe))
-    assert type(pipe) is cls
-    assert_same(stock(pipe, left, ensemble_size=3, batch_size=2), reference)
 
 
 @BOTH_GRADIENTS
 def test_a_call_gives_metres_leaves_the_pipeline_as_it_was_and_nothing_alive(guided, monkeypatch, gradient):
     """The collector of cycles is off: it knows nothing of a device's memory."""
     pipe, runs, begin = guided.pipe, [], GuidedRun.__init__
-    reference = stock(pipe, guided.left)
+    reference = guided.stock()
 
     def remembered(run, *args, **kwargs):
         runs.append(weakref.ref(run))
@@ -104,11 +79,11 @@ def test_a_call_gives_metres_leaves_the_pipeline_as_it_was_and_nothing_alive(gui
     assert "forward" not in vars(pipe.unet) and not hasattr(pipe.unet, "_diffusers_hook")
     assert not pipe.unet.conv_in.weight.requires_grad and pipe.unet.conv_out.weight.requires_grad
     assert all(p.grad is None for p in pipe.unet.parameters())
-    assert_same(stock(pipe, guided.left), reference)
+    assert_same(guided.stock(), reference)
     shape = (1, 48, 64, 1)
-    assert out.prediction.shape == out.visible.shape == out.photometric_error.shape == shape
-    assert np.isfinite(out.prediction).all() and (out.prediction > 0).all()
-    assert out.relative.shape == shape and out.visible.dtype == bool
+    for values in (out.prediction, out.visible, out.photometric_error, out.relative):
+        assert values.shape == shape
+    assert np.isfinite(out.prediction).all() and (out.prediction > 0).all() and out.visible.dtype == bool
     assert out.scale.shape == out.shift.shape == out.global_scale.shape == (1, 1)
     np.testing.assert_allclose(out.K[0], guided.pair.K)
     assert [r.step for r in out.history] == [0, 1] and out.uncertainty is None and out.latent is None
@@ -119,19 +94,18 @@ def test_a_failing_call_leaves_the_pipeline_as_it_was(guided, error):
     def fail(pipe, i, t, values):
         raise error
 
-    reference = stock(guided.pipe, guided.left)
+    reference = guided.stock()
     with pytest.raises(type(error)):
-        guided({"gradient": "full", "weights": PHOTOMETRIC}, callback_on_step_end=fail)
+        guided(FULL | {"weights": PHOTOMETRIC}, callback_on_step_end=fail)
     assert all(p.requires_grad for p in guided.pipe.unet.parameters())
-    assert_same(stock(guided.pipe, guided.left), reference)
+    assert_same(guided.stock(), reference)
 
 
 @BOTH_GRADIENTS
 def test_scale_and_shift_only_leaves_latents_untouched(guided, gradient):
     """S5.3, Table 4."""
-    reference = stock(guided.pipe, guided.left)
     out = guided({"optimize_latents": False, "gradient": gradient}, output_latent=True)
-    assert torch.equal(out.latent, reference.latent)
+    assert torch.equal(out.latent, guided.stock().latent)
     assert out.history[0].s_hat != out.history[1].s_hat
 
 
@@ -140,12 +114,12 @@ def test_batches_and_ensembles(guided):
     one, two = (guided({"weights": PHOTOMETRIC}, batch_size=size, **call) for size in (1, 2))
     np.testing.assert_allclose(one.prediction, two.prediction, rtol=2e-3)
     assert one.uncertainty.shape == (1, 48, 64, 1) and one.scale.shape == (1, 3)
-    pair, left = guided.pair, guided.left
+    pair = guided.pair
     bigger = np.asarray(Image.fromarray(pair.right).resize((96, 72)))
     K_bigger = np.diag([1.5, 1.5, 1]) @ pair.K + np.array([[0, 0, 0.25], [0, 0, 0.25], [0, 0, 0]])
-    guidance = GeometryGuidance([pair.right, bigger], [pair.K, (pair.K, K_bigger)], pair.E, **FAST)
+    both = GeometryGuidance([pair.right, bigger], [pair.K, (pair.K, K_bigger)], pair.E, **FAST)
     noise = torch.randn(1, 4, 24, 32, generator=seeded())
-    out = guided(guidance, [left, left], latents=noise.repeat(2, 1, 1, 1), batch_size=2)
+    out = guided.pipe([pair.left] * 2, guidance=both, latents=noise.repeat(2, 1, 1, 1), batch_size=2)
     assert out.prediction.shape == (2, 48, 64, 1) and out.K.shape == (2, 3, 3)
     np.testing.assert_allclose(out.prediction[:1], guided(latents=noise).prediction, rtol=2e-3)
 
@@ -191,32 +165,33 @@ def test_a_callback_sees_and_replaces(guided):
     ],
 )
 def test_a_bad_answer_of_a_callback_is_told_as_such(guided, answer, message):
-    with pytest.raises((InputError, TypeError), match=message):
+    with pytest.raises((ValueError, TypeError), match=message):
         guided({"weights": PHOTOMETRIC}, callback_on_step_end=lambda *_: answer)
 
 
-@pytest.mark.parametrize("knobs", [{}, {"crisp": False}])
-def test_bicubic_enlargement_stays_within_the_map(make_oracle, textured_plane, knobs):
+@pytest.mark.parametrize("crisp", [True, False])
+def test_bicubic_enlargement_stays_within_the_map(make_oracle, textured_plane, crisp):
     """It overshoots at a step of depth, below 0 m from 3 m to 60 m."""
     relative = np.zeros((24, 32), np.float32)
     relative[:, 16:] = 1.0
-    pair, guided = textured_plane, Guided(make_oracle(relative), textured_plane)
-    guidance = GeometryGuidance(pair.right, pair.K, pair.E, depth_range=(3.0, 60.0), **knobs)
-    depth_m = guided(guidance, processing_resolution=32, resample_method_output="bicubic").prediction
+    knobs = {"depth_range": (3.0, 60.0), "crisp": crisp}
+    call = {"processing_resolution": 32, "resample_method_output": "bicubic"}
+    depth_m = guided_call(make_oracle(relative), textured_plane, knobs, **call).prediction
     assert np.isfinite(depth_m).all() and depth_m.min() > 0
 
 
 BETAS = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012}
+V = BETAS | {"prediction_type": "v_prediction"}
 EPSILON = {"prediction_type": "epsilon", "rescale_betas_zero_snr": False}
 LEADING = {"timestep_spacing": "leading", "rescale_betas_zero_snr": False}
 SCHEDULERS = {
-    "ddim-leading": lambda: DDIMScheduler(**(SCHEDULER | LEADING)),
+    "ddim-leading": lambda: DDIMScheduler(**SCHEDULER | LEADING),
     "ddim-zero-snr": lambda: DDIMScheduler(**SCHEDULER),
-    "ddim-epsilon": lambda: DDIMScheduler(**(SCHEDULER | EPSILON)),
-    "ddim-sample": lambda: DDIMScheduler(**(SCHEDULER | {"prediction_type": "sample"})),
-    "lcm": lambda: LCMScheduler(**BETAS, prediction_type="v_prediction"),
-    "ddpm": lambda: DDPMScheduler(**BETAS, prediction_type="v_prediction", clip_sample=False),
-    "dpm": lambda: DPMSolverMultistepScheduler(**BETAS, prediction_type="v_prediction"),
+    "ddim-epsilon": lambda: DDIMScheduler(**SCHEDULER | EPSILON),
+    "ddim-sample": lambda: DDIMScheduler(**SCHEDULER | {"prediction_type": "sample"}),
+    "lcm": lambda: LCMScheduler(**V),
+    "ddpm": lambda: DDPMScheduler(**V, clip_sample=False),
+    "dpm": lambda: DPMSolverMultistepScheduler(**V),
 }
 
 
@@ -224,11 +199,11 @@ SCHEDULERS = {
 def test_every_scheduler_is_guided_and_restored(make_pipeline, textured_plane, name):
     """With the gradient through the network at every other one; the kinds of the gradient meet above."""
     guided = Guided(make_pipeline(SCHEDULERS[name]()), textured_plane)
-    reference = stock(guided.pipe, guided.left, num_inference_steps=3)
+    reference = guided.stock(num_inference_steps=3)
     gradient = "full" if list(SCHEDULERS).index(name) % 2 else "denoised"
     out = guided({"gradient": gradient, "corrections": 3, "inner_steps": 1}, num_inference_steps=3)
     assert np.isfinite(out.prediction).all() and len(out.history) == 3
-    assert_same(stock(guided.pipe, guided.left, num_inference_steps=3), reference)
+    assert_same(guided.stock(num_inference_steps=3), reference)
 
 
 def test_leading_ddim_runs_as_trailing_unless_told(make_pipeline, textured_plane):
@@ -239,20 +214,21 @@ def test_leading_ddim_runs_as_trailing_unless_told(make_pipeline, textured_plane
     assert steps == [999, 749, 499, 249, 750, 500, 250, 0]
 
 
-def test_saved_while_enabled_it_is_a_stock_pipeline(make_pipeline, tmp_path, left):
-    reference = stock(make_pipeline(), left)
-    pipe = enable_geometry_guidance(make_pipeline())
-    pipe.save_pretrained(tmp_path / "p")
-    assert isinstance(pipe, GuidedMarigoldDepthPipeline)
-    index = json.loads((tmp_path / "p" / "model_index.json").read_text())
+def test_saved_while_enabled_it_is_a_stock_pipeline(make_pipeline, tmp_path, guided):
+    stock = make_pipeline()
+    assert enable_geometry_guidance(guided.pipe) is guided.pipe  # once more
+    guided.pipe.save_pretrained(tmp_path)
+    index = json.loads((tmp_path / "model_index.json").read_text())
     assert index["_class_name"] == "MarigoldDepthPipeline"
     assert index["scheduler"] == ["diffusers", "DDIMScheduler"]
-    again = DiffusionPipeline.from_pretrained(tmp_path / "p")
-    again.set_progress_bar_config(disable=True)
-    assert type(again).__name__ == "MarigoldDepthPipeline"
-    np.testing.assert_allclose(stock(again, left).prediction, reference.prediction, rtol=1e-4)
-    made = GuidedMarigoldDepthPipeline.from_pretrained(tmp_path / "p")
-    assert isinstance(made, GuidedMarigoldDepthPipeline)
+    again = quiet(DiffusionPipeline.from_pretrained(tmp_path))
+    assert type(again) is type(stock)
+    expected, found = (pipe(guided.pair.left, generator=seeded()).prediction for pipe in (stock, again))
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    made = GuidedMarigoldDepthPipeline.from_pretrained(tmp_path)
+    for pipe in (made, guided.pipe):
+        assert isinstance(pipe, GuidedMarigoldDepthPipeline)
+    assert type(disable_geometry_guidance(disable_geometry_guidance(guided.pipe))) is type(stock)
 
 
 def test_inference_mode_forbids_updates_alone(guided):
@@ -263,23 +239,21 @@ def test_inference_mode_forbids_updates_alone(guided):
 
 
 def _sequential(pipe):
-    hook = type("AlignDevicesHook", (), {"offload": True})
-    pipe.unet.conv_in._hf_hook = hook()
+    pipe.unet.conv_in._hf_hook = type("AlignDevicesHook", (), {"offload": True})()
 
 
-FULL = {"gradient": "full"}
+def _scheduled(make, **options):
+    return lambda pipe: setattr(pipe, "scheduler", make(**options))
+
+
 CAST = torch.bfloat16, torch.float32
 
 
 @pytest.mark.parametrize(
     ("change", "knobs", "message"),
     [
-        (lambda p: setattr(p, "scheduler", EulerDiscreteScheduler()), {}, "EulerDiscreteScheduler"),
-        (
-            lambda p: setattr(p, "scheduler", DDIMScheduler(**SCHEDULER, thresholding=True)),
-            {},
-            "thresholding",
-        ),
+        (_scheduled(EulerDiscreteScheduler), {}, "EulerDiscreteScheduler"),
+        (_scheduled(DDIMScheduler, **SCHEDULER, thresholding=True), {}, "thresholding"),
         (_sequential, {}, "sequential"),
         (lambda p: setattr(p, "_all_hooks", [object()]), FULL, "enable_model_cpu_offload"),
         (lambda p: p.vae.enable_layerwise_casting(*CAST), {}, "layerwise casting"),
@@ -298,24 +272,22 @@ def test_what_cannot_be_guided_is_refused_before_anything_is_computed(
 def test_bad_arguments_of_a_call_are_named(guided, make_pipeline):
     pair = guided.pair
     with pytest.raises(TypeError, match="guidance must be a GeometryGuidance"):
-        guided.pipe(guided.left, guidance={"right": guided.left})
+        guided.pipe(pair.left, guidance={"right": pair.right})
     larger = np.diag([3.0, 3.0, 1.0]) @ pair.K
     with pytest.raises(ValueError, match="another resolution"):
-        guided(GeometryGuidance(pair.right, (larger, pair.K), pair.E, **FAST))
+        guided_call(guided.pipe, pair, GeometryGuidance(pair.right, (larger, pair.K), pair.E))
     with pytest.raises(TypeError, match="adapter"):
         enable_geometry_guidance(object())
     pipe = make_pipeline()
-    hides = {"__call__": lambda self, image, **kwargs: None}
-    pipe.__class__ = type("Hides", (type(pipe),), hides)
+    pipe.__class__ = type("Hides", (type(pipe),), {"__call__": lambda self, image, **kwargs: None})
     with pytest.raises(ValueError, match=r"must name the arguments .* no output_type.*write them out"):
         enable_geometry_guidance(pipe)
 
 
 def test_one_number_never_prefers_what_no_camera_sees(make_oracle):
     pair = plane_pair(baseline=1.6)
-    guided = Guided(make_oracle(pair.depth_m / pair.depth_m.max()), pair)
     guidance = GeometryGuidance.paper(pair.right, pair.K, pair.E, inner_steps=0, min_steps=1)
-    assert guided(guidance).visible.any()
+    assert guided_call(make_oracle(pair.depth_m / pair.depth_m.max()), pair, guidance).visible.any()
 
 
 @pytest.mark.parametrize("prediction_type", ["depth", "disparity"])

@@ -4,31 +4,27 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.runtime.hooks import images_in_float32
+from tests.conftest import guided_call
 from tests.contracts.tiny_priors import make_e2e_ft
 
 
 @pytest.mark.parametrize(("count", "gradient"), [(1, "full"), (20, "denoised")])
-def test_a_handful_of_known_points_is_enough(make_pipeline, textured_plane, count, gradient):
+def test_a_handful_of_known_points_is_enough(pipe, textured_plane, count, gradient):
     """The loss is a mean over so few pixels that each one's share is thousands of times an image's."""
     pair, points = textured_plane, np.zeros((48, 64), np.float32)
     at = np.random.default_rng(0).choice(48 * 64, count, replace=False)
     points.flat[at] = pair.depth_m.flat[at]
-    results = []
-    for dtype in (torch.float16, torch.float32):
-        pipe = enable_geometry_guidance(make_pipeline().to(dtype))
-        knobs = {"gradient": gradient, "inner_steps": 3, "correct": False}
-        guidance = GeometryGuidance.from_points(points, pair.K, **knobs)
-        call = {"generator": torch.Generator().manual_seed(0), "num_inference_steps": 2}
-        results.append(pipe(pair.left, guidance=guidance, **call).prediction)
-    assert np.isfinite(results[0]).all()
-    assert np.median(np.abs(results[0] / results[1] - 1)) < 0.1
+    knobs = {"gradient": gradient, "inner_steps": 3, "correct": False}
+    guidance = GeometryGuidance.from_points(points, pair.K, **knobs)
+    full, half = (guided_call(pipe.to(d), pair, guidance).prediction for d in (torch.float32, torch.float16))
+    assert np.isfinite(half).all()
+    assert np.median(np.abs(half / full - 1)) < 0.1
 
 
-def test_white_of_16_bits_is_no_overflow(make_pipeline, textured_plane):
+def test_white_of_16_bits_is_no_overflow(pipe, textured_plane):
     """float16 ends at 65504; what the processor is given is cast once it is in [0, 1]."""
-    pipe = make_pipeline().to(torch.float16)
     image = textured_plane.left.astype(np.uint16) * 257
     image[0, 0] = 65535
     with images_in_float32(pipe.image_processor):
@@ -37,17 +33,16 @@ def test_white_of_16_bits_is_no_overflow(make_pipeline, textured_plane):
     assert "preprocess" not in vars(pipe.image_processor)
 
 
-def test_an_overflow_of_the_decoder_names_step_tensor_and_cure(make_pipeline, textured_plane):
-    pipe = enable_geometry_guidance(make_pipeline().to(torch.float16))
-    pipe.vae.decoder.conv_out.weight.data.fill_(6e4)
-    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, inner_steps=1)
+def test_an_overflow_of_the_decoder_names_step_tensor_and_cure(pipe, textured_plane):
+    pipe.to(torch.float16).vae.decoder.conv_out.weight.data.fill_(6e4)
     with pytest.raises(ValueError, match=r"decoded map of denoising step 3 .* float16.*bfloat16"):
-        pipe(textured_plane.left, guidance=guidance)
+        guided_call(pipe, textured_plane, {"inner_steps": 1})
 
 
 def test_a_prior_in_float64_gives_the_same_depth(textured_plane):
-    pipe, pair = enable_geometry_guidance(make_e2e_ft()), textured_plane  # it draws nothing
-    guidance = GeometryGuidance(pair.right, pair.K, pair.E, inner_steps=1)
-    expected = pipe(pair.left, guidance=guidance).prediction
-    found = pipe.to(torch.float64)(pair.left, guidance=guidance).prediction
+    pipe = make_e2e_ft()  # it draws nothing
+    expected, found = (
+        guided_call(pipe.to(dtype), textured_plane, {"inner_steps": 1}).prediction
+        for dtype in (torch.float32, torch.float64)
+    )
     np.testing.assert_allclose(found, expected, rtol=1e-4)

@@ -8,13 +8,14 @@ import torch
 from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from PIL import Image
 
-from geodiff_plugin import GeometryGuidance, InputError, enable_geometry_guidance
+from geodiff_plugin import GeometryGuidance, InputError
 from geodiff_plugin.runtime.checks import check_left_images
 
 LEFT = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
 FLOATS = LEFT.astype(np.float32) / 255
 WITH_NAN = np.where(np.arange(64)[None, :, None] == 4, np.float32(np.nan), FLOATS)
 ALPHA = np.dstack([LEFT, np.full(LEFT.shape[:2], 7, np.uint8)])
+PALETTE = Image.fromarray(LEFT).convert("P")
 TOLD = ["image has an alpha channel; it is dropped."]
 
 
@@ -45,17 +46,11 @@ TOLD = ["image has an alpha channel; it is dropped."]
         ({"latents": torch.full((1, 4, 8, 8), torch.nan)}, "latents must be finite; got NaN or infinity"),
     ],
 )
-def test_bad_arguments_are_named_before_anything_runs(
-    make_pipeline, textured_plane, monkeypatch, arguments, message
-):
-    pair, pipe = textured_plane, enable_geometry_guidance(make_pipeline())
+def test_bad_arguments_are_named_before_anything_runs(pipe, textured_plane, monkeypatch, arguments, message):
+    pair = textured_plane
     monkeypatch.setattr(GeometryGuidance, "prepare", lambda *_: pytest.fail("something ran"))
     with pytest.raises(InputError, match=message):
         pipe(**({"image": LEFT, "guidance": GeometryGuidance(pair.right, pair.K, pair.E)} | arguments))
-
-
-def converted(mode: str) -> Image.Image:
-    return Image.fromarray(LEFT).convert(mode)
 
 
 @pytest.mark.parametrize(
@@ -66,7 +61,7 @@ def converted(mode: str) -> Image.Image:
         ([ALPHA], [LEFT], ["image[0]" + TOLD[0].removeprefix("image")]),
         (FLOATS * 1.0005, np.clip(FLOATS * 1.0005, 0, 1), []),
         (LEFT[:, ::-1] / 255.0, np.ascontiguousarray(LEFT[:, ::-1]), []),
-        (converted("P"), np.asarray(converted("P").convert("RGB")), []),
+        (PALETTE, np.asarray(PALETTE.convert("RGB")), []),
     ],
 )
 def test_what_the_stock_call_does_not_read_is_read_as_the_right_image_is(image, like, said):
@@ -99,10 +94,10 @@ def test_what_the_stock_call_reads_goes_on_untouched(image):
     assert found is image and count == (2 if isinstance(image, list) or np.ndim(image) == 4 else 1)
 
 
-def test_without_guidance_the_errors_are_the_stock_ones(make_pipeline):
-    for image in (ALPHA, LEFT > 90):
-        with pytest.raises(ValueError) as stock:
-            make_pipeline()(image)
-        with pytest.raises(ValueError) as enabled:
-            enable_geometry_guidance(make_pipeline())(image)
-        assert str(enabled.value) == str(stock.value) and not isinstance(enabled.value, InputError)
+@pytest.mark.parametrize("image", [ALPHA, LEFT > 90])
+def test_without_guidance_the_errors_are_the_stock_ones(make_pipeline, pipe, image):
+    with pytest.raises(ValueError) as stock:
+        make_pipeline()(image)
+    with pytest.raises(ValueError) as enabled:
+        pipe(image)
+    assert str(enabled.value) == str(stock.value) and not isinstance(enabled.value, InputError)

@@ -1,16 +1,15 @@
-"""``decoder``: a tiny autoencoder between the steps, the prior's own for the result."""
+"""What a corrected step decodes and encodes; ``decoder``: a tiny autoencoder between the steps."""
 
-from collections import Counter
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 from diffusers import AutoencoderTiny
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.priors import tiny as tiny_module
 from geodiff_plugin.priors.tiny import KNOWN, _loaded
-from tests.conftest import make_vae
+from tests.conftest import guided_call, make_vae
 
 
 def tiny_folder(path, channels=4, stages=2):
@@ -22,82 +21,83 @@ def tiny_folder(path, channels=4, stages=2):
     return str(path)
 
 
-def guided(pipe, pair, decoder, output_latent=False, **knobs):
-    knobs = {"corrections": 3} | knobs
-    guidance = GeometryGuidance(pair.right, pair.K, pair.E, decoder=decoder, **knobs)
-    call = {"generator": torch.Generator().manual_seed(0), "num_inference_steps": 3}
-    pipe = enable_geometry_guidance(pipe)
-    return pipe(pair.left, guidance=guidance, output_latent=output_latent, **call).prediction
+@pytest.fixture
+def folder(tmp_path):
+    return tiny_folder(tmp_path / "tiny")
 
 
-def counted(vae, monkeypatch) -> Counter:
-    """How often an autoencoder decodes and encodes."""
-    calls: Counter = Counter()
+@pytest.fixture
+def guided(pipe, textured_plane):
+    def call(decoder="full", output_latent=False, steps=3, **knobs):
+        knobs = {"corrections": 3, "decoder": decoder} | knobs
+        return guided_call(
+            pipe, textured_plane, knobs, num_inference_steps=steps, output_latent=output_latent
+        )
 
-    def counting(name, method):
-        def call(*args, **kwargs):
-            calls[name] += 1
-            return method(*args, **kwargs)
+    return call
 
-        return call
 
-    for name in ("decode", "encode"):
-        monkeypatch.setattr(vae, name, counting(name, getattr(vae, name)))
-    return calls
+@pytest.fixture
+def count(monkeypatch):
+    """Count from now on how often an autoencoder decodes and encodes; the function tells."""
+
+    def start(vae):
+        mocks = [Mock(wraps=getattr(vae, name)) for name in ("decode", "encode")]
+        for name, mock in zip(("decode", "encode"), mocks, strict=True):
+            monkeypatch.setattr(vae, name, mock)
+        return lambda: tuple(mock.call_count for mock in mocks)
+
+    return start
+
+
+@pytest.mark.parametrize(("corrections", "corrected"), [(1, [4]), (3, [2, 3, 4])])
+def test_a_step_that_is_not_corrected_is_the_priors_own(pipe, guided, count, corrections, corrected):
+    counted = count(pipe.vae)
+    assert [report.step for report in guided(steps=5, corrections=corrections).history] == corrected
+    # A correction decodes once and encodes twice, the last one not at all; the stock call encodes the image.
+    assert counted() == (corrections, 1 + 2 * (corrections - 1))
+
+
+def test_the_result_does_not_depend_on_whether_the_latent_is_asked_for(guided):
+    np.testing.assert_array_equal(guided().prediction, guided(output_latent=True).prediction)
 
 
 @pytest.mark.parametrize("output_latent", [False, True])
-def test_the_priors_own_decoder_makes_the_result(
-    make_pipeline, textured_plane, tmp_path, monkeypatch, output_latent
-):
-    folder, pipe = tiny_folder(tmp_path / "tiny"), make_pipeline()
+def test_the_priors_own_decoder_makes_the_result(pipe, guided, folder, count, output_latent):
     own = pipe.vae
-    full, tiny = counted(own, monkeypatch), counted(_loaded(folder, torch.float32, "cpu"), monkeypatch)
-    depth_m = guided(pipe, textured_plane, folder, output_latent)
+    full, tiny = count(own), count(_loaded(folder, torch.float32, "cpu"))
+    depth_m = guided(folder, output_latent).prediction
     assert np.isfinite(depth_m).all() and (depth_m > 0).all()
-    assert full == {"decode": 1, "encode": 1}  # the result, and the stock call's code of the image
+    assert full() == (1, 1)  # the result, and the stock call's code of the image
     # The last correction is the full decoder's where no latent is asked for.
     corrected = 3 if output_latent else 2
-    assert tiny == {"decode": corrected, "encode": 2 * corrected}
+    assert tiny() == (corrected, 2 * corrected)
     assert pipe.vae is own and pipe.components["vae"] is own and "Tiny" not in str(pipe.config["vae"])
 
 
-def test_the_pipeline_is_left_as_found_by_an_error_in_the_loop(
-    make_pipeline, textured_plane, tmp_path, monkeypatch
-):
-    folder, pipe = tiny_folder(tmp_path / "tiny"), make_pipeline()
-    own = pipe.vae
-
-    def fails(*args, **kwargs):
-        raise RuntimeError("out of memory")
-
+def test_the_pipeline_is_left_as_found_by_an_error_in_the_loop(pipe, guided, folder, monkeypatch):
+    own, fails = pipe.vae, Mock(side_effect=RuntimeError("out of memory"))
     monkeypatch.setattr(_loaded(folder, torch.float32, "cpu"), "decode", fails)
     with pytest.raises(RuntimeError, match="out of memory"):
-        guided(pipe, textured_plane, folder)
+        guided(folder)
     assert pipe.vae is own
 
 
-def test_with_the_same_weights_in_the_loop_nothing_changes(
-    make_pipeline, textured_plane, tmp_path, monkeypatch
-):
-    folder = tiny_folder(tmp_path / "tiny")
+def test_with_the_same_weights_in_the_loop_nothing_changes(guided, folder, monkeypatch):
     monkeypatch.setattr(tiny_module, "_loaded", lambda *_: make_vae())
-    found, full = (guided(make_pipeline(), textured_plane, decoder) for decoder in (folder, "full"))
-    np.testing.assert_array_equal(found, full)
+    np.testing.assert_array_equal(guided(folder).prediction, guided().prediction)
 
 
-def test_updates_go_through_the_tiny_decoder(make_pipeline, textured_plane, tmp_path):
-    folder, knobs = tiny_folder(tmp_path / "tiny"), {"inner_steps": 2, "correct": False}
-    still, moved = (
-        guided(make_pipeline(), textured_plane, folder, step_latents=rate, **knobs) for rate in (0.0, 0.1)
-    )
+def test_updates_go_through_the_tiny_decoder(guided, folder):
+    knobs = {"inner_steps": 2, "correct": False}
+    still, moved = (guided(folder, step_latents=rate, **knobs).prediction for rate in (0.0, 0.1))
     assert np.isfinite(moved).all() and np.abs(moved - still).max() > 1e-4
 
 
-def test_what_cannot_decode_is_refused(make_pipeline, textured_plane, tmp_path, monkeypatch):
-    def unreachable(*args, **kwargs):
-        raise OSError("We couldn't connect to 'https://huggingface.co' to load the files")
-
+def test_what_cannot_decode_is_refused(guided, tmp_path, monkeypatch):
+    unreachable = Mock(
+        side_effect=OSError("We couldn't connect to 'https://huggingface.co' to load the files")
+    )
     (tmp_path / "empty").mkdir()
     for decoder, sentence in (
         ("tiny", r"decoder must be 'full' with .*folder or a hub id"),
@@ -111,13 +111,13 @@ def test_what_cannot_decode_is_refused(make_pipeline, textured_plane, tmp_path, 
         if decoder == "nobody/no-such-decoder":
             monkeypatch.setattr(AutoencoderTiny, "from_pretrained", unreachable)
         with pytest.raises((ValueError, TypeError), match=sentence):
-            guided(make_pipeline(), textured_plane, decoder)
+            guided(decoder)
 
 
-def test_sd_2s_latent_is_known(make_pipeline, textured_plane, monkeypatch):
-    asked, pipe = [], make_pipeline()
+def test_sd_2s_latent_is_known(pipe, guided, monkeypatch):
+    loaded = Mock(return_value=make_vae())
     pipe.vae.register_to_config(scaling_factor=0.18215)
     monkeypatch.setitem(KNOWN, (4, 2, 0.18215), KNOWN[4, 8, 0.18215])  # a tiny one has cells of 2 pixels
-    monkeypatch.setattr(tiny_module, "_loaded", lambda name, *_: (asked.append(name), make_vae())[1])
-    guided(pipe, textured_plane, "tiny")
-    assert asked == ["madebyollin/taesd"]
+    monkeypatch.setattr(tiny_module, "_loaded", loaded)
+    guided("tiny")
+    assert {call.args[0] for call in loaded.call_args_list} == {"madebyollin/taesd"}

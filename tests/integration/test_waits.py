@@ -8,7 +8,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from tests.conftest import guided_call
 
 #: Operations whose result has a size, or is a number, that only the device knows.
 READ_BACK = (
@@ -41,9 +41,8 @@ class ReadBacks(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("knobs", [{"inner_steps": 1}, {}, {"gradient": "full", "inner_steps": 1}])
-def test_no_step_waits(make_pipeline, textured_plane, monkeypatch, knobs):
-    pair, pipe, reads = textured_plane, enable_geometry_guidance(make_pipeline()), ReadBacks()
-    decode = type(pipe).decode_prediction
+def test_no_step_waits(pipe, textured_plane, monkeypatch, knobs):
+    reads, decode = ReadBacks(), type(pipe).decode_prediction
 
     def after_the_steps(self, latents):
         reads.counts = False
@@ -51,14 +50,12 @@ def test_no_step_waits(make_pipeline, textured_plane, monkeypatch, knobs):
 
     pipe.unet.register_forward_pre_hook(lambda *_: setattr(reads, "counts", True))
     monkeypatch.setattr(type(pipe), "decode_prediction", after_the_steps)
-    guidance = GeometryGuidance(pair.right, pair.K, pair.E, **knobs)
     with reads:
-        pipe(pair.left, guidance=guidance, num_inference_steps=2)
+        guided_call(pipe, textured_plane, knobs, num_inference_steps=2)
     assert set(reads.found) == ON_THE_CPU  # which shows that it counted
 
 
-def test_what_waits_is_found():
-    """A number and a mask, as a step may come to hold them."""
+def test_a_number_and_a_mask_are_found():
     x = torch.rand(4, 4)
     with ReadBacks() as reads:
         float(x.mean())
