@@ -153,15 +153,16 @@ def render_plane(K, camera_to_world, size, normal, offset, seed):
     return (image * 255).round().astype(np.uint8), depth.astype(np.float32)
 
 
-def plane_pair(size=(48, 64), baseline=0.12, rotation_y=0.0, seed=0, focal=60.0) -> PlanePair:
+def plane_pair(
+    size=(48, 64), baseline=0.12, rotation_y=0.0, seed=0, focal=60.0, normal=(0.25, -0.35, 1.0)
+) -> PlanePair:
     K = np.array([[focal, 0, size[1] / 2 - 0.5], [0, focal, size[0] / 2 - 0.5], [0, 0, 1]])
     E = np.eye(4)
     c, s = np.cos(rotation_y), np.sin(rotation_y)
     E[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
     E[0, 3] = baseline
-    normal = np.array([0.25, -0.35, 1.0])
-    left, depth = render_plane(K, np.eye(4), size, normal, 2.0, seed)
-    right, _ = render_plane(K, E, size, normal, 2.0, seed)
+    left, depth = render_plane(K, np.eye(4), size, np.array(normal), 2.0, seed)
+    right, _ = render_plane(K, E, size, np.array(normal), 2.0, seed)
     return PlanePair(left, right, K, E, depth)
 
 

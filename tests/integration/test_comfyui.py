@@ -3,8 +3,8 @@
 import importlib.util
 import json
 import sys
-import types
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,22 +25,17 @@ class Interrupted(Exception):
 @pytest.fixture
 def host(monkeypatch, tmp_path):
     """Stubs of ``folder_paths`` and ``comfy``, as far as nodes use them."""
-    state = types.SimpleNamespace(bars=[], freed=[], interrupt=False, folder=tmp_path)
-    folders = types.ModuleType("folder_paths")
-    folders.get_input_directory = lambda: str(tmp_path)
-    folders.get_output_directory = lambda: str(tmp_path / "output")
+    state = SimpleNamespace(bars=[], freed=[], interrupt=False, folder=tmp_path)
 
     def save_path(prefix, output):
-        folder = Path(output) / Path(prefix).parent
+        name, below = Path(prefix).name, Path(prefix).parent
+        folder = Path(output) / below
         folder.mkdir(parents=True, exist_ok=True)
-        number = 1 + len(list(folder.iterdir()))
-        return str(folder), Path(prefix).name, number, str(Path(prefix).parent), prefix
-
-    folders.get_save_image_path = save_path
+        return str(folder), name, 1 + len(list(folder.iterdir())), str(below), prefix
 
     class ProgressBar:
         def __init__(self, total):
-            self.total, self.done = total, 0
+            self.done = 0
             state.bars.append(self)
 
         def update(self, count):
@@ -50,14 +45,21 @@ def host(monkeypatch, tmp_path):
         if state.interrupt:
             raise Interrupted
 
-    names = ("comfy", "comfy.utils", "comfy.model_management")
-    comfy, utils, management = map(types.ModuleType, names)
-    utils.ProgressBar, management.get_torch_device = ProgressBar, lambda: torch.device("cpu")
-    management.throw_exception_if_processing_interrupted = throw
-    management.free_memory = lambda size, device: state.freed.append(size)
-    comfy.utils, comfy.model_management = utils, management
-    for module in (folders, comfy, utils, management):
-        monkeypatch.setitem(sys.modules, module.__name__, module)
+    folders = SimpleNamespace(
+        get_input_directory=lambda: str(tmp_path),
+        get_output_directory=lambda: str(tmp_path / "output"),
+        get_save_image_path=save_path,
+    )
+    utils = SimpleNamespace(ProgressBar=ProgressBar)
+    management = SimpleNamespace(
+        get_torch_device=lambda: torch.device("cpu"),
+        throw_exception_if_processing_interrupted=throw,
+        free_memory=lambda size, device: state.freed.append(size),
+    )
+    comfy = SimpleNamespace(utils=utils, model_management=management)
+    stubs = {"comfy.utils": utils, "comfy.model_management": management}
+    for name, stub in ({"folder_paths": folders, "comfy": comfy} | stubs).items():
+        monkeypatch.setitem(sys.modules, name, stub)
     return state
 
 
@@ -79,16 +81,8 @@ def pair(textured_plane, host):
     """Images as the host hands them over, and a calibration in its input folder."""
     numbers = " ".join(f"{value:g}" for value in textured_plane.K.ravel())
     (host.folder / "K.txt").write_text(f"{numbers}\n0.12\n")
-    left, right = (
-        torch.from_numpy(image)[None].float() / 255 for image in (textured_plane.left, textured_plane.right)
-    )
-    return left, right
-
-
-@pytest.fixture
-def prior(make_pipeline, tmp_path):
-    make_pipeline().save_pretrained(tmp_path / "prior")
-    return str(tmp_path / "prior")
+    images = textured_plane.left, textured_plane.right
+    return [torch.from_numpy(image)[None].float() / 255 for image in images]
 
 
 def inputs_of(node: type) -> dict:
@@ -126,7 +120,7 @@ def test_the_nodes_run_along_the_workflow(pack, pair, prior, host, textured_plan
         (rig,) = classes["GeoDiffCalibration"]().read("K.txt", image=left)
         assert isinstance(rig, Rig) and rig.E[0, 3] == pytest.approx(0.12)
         answer = classes["GeoDiffDepth"]().estimate(
-            left.repeat(2, 1, 1, 1), right.repeat(2, 1, 1, 1), rig, prior, 2, 1, "default", 2**64 - 1
+            left.repeat(2, 1, 1, 1), right.repeat(2, 1, 1, 1), rig, str(prior), 2, 1, "default", 2**64 - 1
         )
     depth, coloured, near_is_white, confidence, verdict = answer["result"]
     assert verdict.startswith(("Trusted.", "Not trusted. ")) and answer["ui"]["text"] == [verdict]
@@ -171,4 +165,4 @@ def test_the_host_can_interrupt(pack, pair, prior, host):
     node = pack.NODE_CLASS_MAPPINGS["GeoDiffDepth"]()
     (rig,) = pack.NODE_CLASS_MAPPINGS["GeoDiffCalibration"]().read("K.txt")
     with pytest.raises(Interrupted):
-        node.estimate(*pair, rig, prior, 2, 1, "default", 0)
+        node.estimate(*pair, rig, str(prior), 2, 1, "default", 0)

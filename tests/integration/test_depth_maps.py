@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from geodiff_plugin import GeometryGuidance, InputError, enable_geometry_guidance, load_prior
+from geodiff_plugin import GeometryGuidance, InputError, load_prior
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.formats.depth import read_map, write_pfm
+from tests.conftest import guided_call, quiet
 
 PAIR = read_demo_pair()
 TRUTH = PAIR.depth_m.astype(np.float64)
@@ -20,11 +21,9 @@ SMALL = cv2.resize(TRUTH, (149, 112), interpolation=cv2.INTER_AREA)
 BLURRED = cv2.GaussianBlur(TRUTH, (0, 0), 6)
 
 
-def guided(depth_map, space, **call):
-    pipe = enable_geometry_guidance(load_prior("map", space=space))
-    pipe.set_progress_bar_config(disable=True)
+def guided(depth_map, space):
     guidance = GeometryGuidance(PAIR.right, (PAIR.rig.K_left, PAIR.rig.K_right), PAIR.rig.E)
-    return pipe(PAIR.left, depth_map=depth_map, guidance=guidance, **call)
+    return guided_call(quiet(load_prior("map", space=space)), PAIR, guidance, depth_map=depth_map)
 
 
 def error_of(output) -> np.ndarray:
@@ -34,16 +33,10 @@ def error_of(output) -> np.ndarray:
 @pytest.mark.parametrize(
     ("depth_map", "space", "most"),
     [
-        pytest.param(7 / TRUTH - 1e3, "disparity", 0.005, id="exact-relative-disparity"),
-        pytest.param(
-            0.2 * np.log(TRUTH).astype(np.float32),
-            "log",
-            0.005,
-            id="exact-relative-log",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(SMALL, "depth", 0.01, id="small"),
-        pytest.param(BLURRED, "depth", 0.035, id="blurred", marks=pytest.mark.slow),
+        (7 / TRUTH - 1e3, "disparity", 0.005),
+        pytest.param(0.2 * np.log(TRUTH).astype(np.float32), "log", 0.005, marks=pytest.mark.slow),
+        (SMALL, "depth", 0.01),
+        pytest.param(BLURRED, "depth", 0.035, marks=pytest.mark.slow),
     ],
 )
 def test_a_map_becomes_metric(depth_map, space, most):
@@ -66,8 +59,7 @@ def test_holes_are_filled_by_the_views_and_are_no_evidence_of_the_prior():
 
 
 def test_several_images_each_with_a_map_of_its_size():
-    pipe = load_prior("map", space="disparity")
-    pipe.set_progress_bar_config(disable=True)
+    pipe = quiet(load_prior("map", space="disparity"))
     images = [Image.fromarray(np.zeros((40, 60, 3), np.uint8))] * 2
     ramp = np.linspace(4, 8, 30)
     maps = [np.tile(ramp, (20, 1)), np.full((50, 70), np.inf)]

@@ -3,6 +3,7 @@
 import copy
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ from diffusers import DDIMScheduler, DPMSolverMultistepScheduler, MarigoldDepthP
 from diffusers.configuration_utils import FrozenDict
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from tests.conftest import SCHEDULER
-from tests.contracts.tiny_priors import AT_64, make_lotus, quiet
+from tests.conftest import SCHEDULER, quiet, seeded
+from tests.contracts.tiny_priors import AT_64, make_lotus
 
 BETAS = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012}
 SCHEDULERS = {
@@ -29,16 +30,20 @@ def sharing(pipe: MarigoldDepthPipeline) -> MarigoldDepthPipeline:
 
 def calls_of(pipe, pair, steps=2, **knobs):
     """A stock call and a guided one, which takes a callback; without a sweep, for the sake of time."""
+    guidance = GeometryGuidance.paper(pair.right, pair.K, pair.E, **knobs)
 
     def stock(**more):
-        seeded = torch.Generator().manual_seed(0)
-        return pipe(pair.left, generator=seeded, num_inference_steps=steps, **more).prediction
+        return pipe(pair.left, generator=seeded(), num_inference_steps=steps, **more).prediction
 
     def guided(callback=None):
-        guidance = GeometryGuidance.paper(pair.right, pair.K, pair.E, **knobs)
         return stock(guidance=guidance, callback_on_step_end=callback)
 
     return stock, guided
+
+
+@pytest.fixture
+def calls(pipe, textured_plane):
+    return calls_of(pipe, textured_plane)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +57,7 @@ def calls_of(pipe, pair, steps=2, **knobs):
 )
 def test_any_call_from_a_callback_is_what_it_is_alone(make_pipeline, textured_plane, name, gradient, other):
     pipe = make_lotus("g") if name == "lotus" else make_pipeline(SCHEDULERS[name]())
-    pipe = enable_geometry_guidance(pipe)
+    enable_geometry_guidance(pipe)
     stock, guided = calls_of(pipe, textured_plane, 1 if name == "lotus" else 2, gradient=gradient)
     inner = {
         "itself": stock,
@@ -84,44 +89,29 @@ def _tensors(attributes: dict) -> dict[str, torch.Tensor]:
     return {name: value for name, value in attributes.items() if torch.is_tensor(value)}
 
 
-def test_methods_that_the_user_replaced_are_used_and_kept(make_pipeline, textured_plane):
-    pipe = enable_geometry_guidance(make_pipeline())
-    stock, guided = calls_of(pipe, textured_plane)
-    reference, plain = guided(), stock()
-    scheduler, calls = pipe.scheduler, []
-
-    def counted(method):
-        def call(*args, **kwargs):
-            calls.append(method.__name__)
-            return method(*args, **kwargs)
-
-        return call
-
-    scheduler.step, scheduler.set_timesteps = step, _ = (
-        counted(scheduler.step),
-        counted(scheduler.set_timesteps),
-    )
+def test_methods_that_the_user_replaced_are_used_and_kept(pipe, calls):
+    stock, guided = calls
+    reference, plain, scheduler, inside = guided(), stock(), pipe.scheduler, []
+    for name in ("step", "set_timesteps"):
+        setattr(scheduler, name, Mock(wraps=getattr(scheduler, name)))
+    step, set_timesteps = scheduler.step, scheduler.set_timesteps
     np.testing.assert_array_equal(guided(), reference)
-    assert calls == ["set_timesteps", "step", "step"] and scheduler.step is step
-    inside = []
+    assert (step.call_count, set_timesteps.call_count) == (2, 1) and scheduler.step is step
     np.testing.assert_array_equal(guided(lambda *_: inside.append(stock())), reference)
     np.testing.assert_array_equal(inside[0], plain)
 
 
-def test_a_scheduler_assigned_in_a_callback_stays(make_pipeline, textured_plane):
-    pipe, other = enable_geometry_guidance(make_pipeline()), SCHEDULERS["dpm"]()
-    guided = calls_of(pipe, textured_plane)[1]
-    reference = guided()
-    found = guided(lambda p, *_: setattr(p, "scheduler", other))
+def test_a_scheduler_assigned_in_a_callback_stays(pipe, calls):
+    reference, other = calls[1](), SCHEDULERS["dpm"]()
+    found = calls[1](lambda p, *_: setattr(p, "scheduler", other))
     np.testing.assert_array_equal(found, reference)  # the call goes on with its own
     assert pipe.scheduler is other and pipe.config["scheduler"][1] == "DPMSolverMultistepScheduler"
 
 
-def test_threads_on_shared_networks_wait_for_each_other(make_pipeline, textured_plane):
-    pipe = enable_geometry_guidance(make_pipeline())
-    stock, guided = calls_of(pipe, textured_plane, gradient="full")
-    twin_guided = calls_of(enable_geometry_guidance(sharing(pipe)), textured_plane, gradient="full")[1]
-    calls = [stock, guided, calls_of(sharing(pipe), textured_plane)[0], twin_guided]
+def test_threads_on_shared_networks_wait_for_each_other(pipe, textured_plane):
+    full, twin = {"gradient": "full"}, enable_geometry_guidance(sharing(pipe))
+    calls = [*calls_of(pipe, textured_plane, **full), calls_of(twin, textured_plane, **full)[1]]
+    calls.append(calls_of(sharing(pipe), textured_plane)[0])
     expected = [call() for call in calls]
     start = threading.Barrier(4)
 
@@ -136,9 +126,8 @@ def test_threads_on_shared_networks_wait_for_each_other(make_pipeline, textured_
     assert all(p.requires_grad for p in pipe.unet.parameters()) and "forward" not in vars(pipe.unet)
 
 
-def test_a_callback_may_wait_for_a_thread_that_calls_the_pipeline(make_pipeline, textured_plane):
-    pipe = enable_geometry_guidance(make_pipeline())
-    stock, guided = calls_of(pipe, textured_plane)
+def test_a_callback_may_wait_for_a_thread_that_calls_the_pipeline(calls):
+    stock, guided = calls
     expected, found = stock(), []
 
     def from_a_thread(*_):
@@ -150,9 +139,8 @@ def test_a_callback_may_wait_for_a_thread_that_calls_the_pipeline(make_pipeline,
 
 
 @pytest.mark.parametrize("guided_again", [False, True])
-def test_a_call_from_a_hook_of_the_network_is_refused(make_pipeline, textured_plane, guided_again):
-    pipe = enable_geometry_guidance(make_pipeline())
-    stock, guided = calls_of(pipe, textured_plane)
+def test_a_call_from_a_hook_of_the_network_is_refused(pipe, calls, guided_again):
+    stock, guided = calls
     hook = pipe.unet.register_forward_hook(lambda *_: (guided if guided_again else stock)())
     with pytest.raises(RuntimeError, match="in the middle of a guided call"):
         guided()

@@ -2,11 +2,13 @@
 
 import os
 import threading
+from concurrent.futures import ThreadPoolExecutor
+from unittest.mock import Mock
 
 import pytest
 import torch
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin import GeometryGuidance
 from geodiff_plugin import _threads as threads
 from geodiff_plugin.guidance import guidance as guidance_module
 
@@ -25,9 +27,9 @@ def one_core(monkeypatch):
 
 
 @pytest.fixture
-def call(make_pipeline, textured_plane):
-    """A call of two steps, and the numbers of threads that its network saw."""
-    pipe, seen, pair = enable_geometry_guidance(make_pipeline()), [], textured_plane
+def call(pipe, textured_plane):
+    """A call of two steps; the numbers of threads that its network saw."""
+    seen, pair = [], textured_plane
     pipe.unet.register_forward_pre_hook(lambda *_: seen.append(torch.get_num_threads()))
 
     def run(callback=None, guided=True):
@@ -36,7 +38,6 @@ def call(make_pipeline, textured_plane):
         pipe(pair.left, guidance=guidance, num_inference_steps=2, callback_on_step_end=callback)
         return list(seen)
 
-    run.pipe = pipe
     return run
 
 
@@ -54,9 +55,6 @@ def test_a_callback_has_the_users_number_and_may_set_another(call):
     assert seen == [MORE] * 2
     call(lambda *_: torch.set_num_threads(1))
     assert torch.get_num_threads() == 1
-
-
-def test_a_number_that_is_set_inside_is_not_taken_back():
     with threads.WithinCores():
         assert torch.get_num_threads() == CORES
         torch.set_num_threads(MORE + 1)
@@ -64,24 +62,18 @@ def test_a_number_that_is_set_inside_is_not_taken_back():
 
 
 @pytest.mark.parametrize("where", ["network", "callback"])
-def test_the_number_is_put_back_when_the_call_raises(call, where):
-    def fails(*_):
-        raise RuntimeError("stopped")
-
+def test_the_number_is_put_back_when_the_call_raises(call, pipe, where):
+    fails = Mock(side_effect=RuntimeError("stopped"))
     if where == "network":
-        call.pipe.unet.register_forward_hook(fails)
+        pipe.unet.register_forward_hook(fails)
     with pytest.raises(RuntimeError, match="stopped"):
         call(fails if where == "callback" else None)
     assert torch.get_num_threads() == MORE
 
 
 def test_evidence_outside_of_a_call_stays_within_the_cores(textured_plane, monkeypatch):
-    seen, make, pair = [], guidance_module.make_evidence, textured_plane
-
-    def watched(*given):
-        seen.append(torch.get_num_threads())
-        return make(*given)
-
+    seen, pair = [], textured_plane
+    watched = Mock(side_effect=lambda *_: seen.append(torch.get_num_threads()))
     monkeypatch.setattr(guidance_module, "make_evidence", watched)
     left = torch.from_numpy(pair.left).permute(2, 0, 1)[None].float()
     GeometryGuidance.paper(pair.right, pair.K, pair.E).prepare(left)
@@ -103,11 +95,8 @@ def test_blocks_of_two_threads_do_not_meet():
         if ends_first:
             meet.wait()
 
-    both = [threading.Thread(target=work, args=(ends_first,)) for ends_first in (True, False)]
-    for thread in both:
-        thread.start()
-    for thread in both:
-        thread.join()
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(work, (True, False)))
     assert (inside, after, torch.get_num_threads()) == ([CORES] * 2, [MORE] * 2, MORE)
 
 

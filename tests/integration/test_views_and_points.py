@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-import torch
-from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_bundled_prior
+from tests.conftest import seeded
 from tests.scenes import Camera, render_views, sample_scene
 from tests.scenes.cameras import intrinsics
 
@@ -18,11 +17,9 @@ def group():
     """Views ``(image, K, camera-to-world)``: left, right, below; depth; some of it, 0 where unknown."""
     scene = sample_scene(1, "room")
     K, world = intrinsics(SIZE, scene.fov_deg), scene.T_world_from_camera.double()
-    poses = [world]
+    poses = [world, world.clone(), world.clone()]
     for axis in (0, 1):
-        E = torch.eye(4, dtype=torch.float64)
-        E[axis, 3] = scene.baseline_m
-        poses.append(world @ E)
+        poses[1 + axis][:3, 3] += scene.baseline_m * world[:3, axis]
     rendered = render_views(scene, [Camera(K, pose) for pose in poses], SIZE)
     images = [(view.image_01.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8) for view in rendered]
     views = [(image, K.numpy(), pose.numpy()) for image, pose in zip(images, poses, strict=True)]
@@ -34,19 +31,8 @@ def group():
 @pytest.fixture(scope="module")
 def run(group):
     """Guided calls on the left view of the group."""
-    pipe = enable_geometry_guidance(load_bundled_prior())
-
-    def call(guidance):
-        generator = torch.Generator().manual_seed(0)
-        left = Image.fromarray(group[0][0][0])
-        return pipe(left, guidance=guidance, num_inference_steps=1, generator=generator)
-
-    return call
-
-
-@pytest.fixture(scope="module")
-def of_points(run, group):
-    return run(GeometryGuidance.from_points(group[2], group[0][0][1], **FAST))
+    pipe, left = enable_geometry_guidance(load_bundled_prior()), group[0][0][0]
+    return lambda guidance: pipe(left, guidance=guidance, num_inference_steps=1, generator=seeded())
 
 
 def abs_rel(out, depth_m):
@@ -67,20 +53,17 @@ def test_further_views_and_points_beside_them(run, group):
     assert abs_rel(both, np.where(sparse > 0, sparse, np.nan)) < 0.05
 
 
-def test_points_instead_of_a_second_view(of_points, group):
-    out = of_points
+def test_points_instead_of_a_second_view_as_a_map_or_as_the_cloud_that_projects_to_it(run, group):
+    (_, K, _), sparse = group[0][0], group[2]
+    out = run(GeometryGuidance.from_points(sparse, K, **FAST))
     assert out.visible is None and out.photometric_error is None and not out.warnings
     assert abs_rel(out, group[1]) < 0.2
     assert set(out.history[0].terms) == {"points", "anchor", "prior_pull"}
-
-
-def test_a_cloud_is_the_map_that_it_projects_to(run, group, of_points):
-    (_, K, _), sparse = group[0][0], group[2]
     rows, columns = sparse.nonzero()
     rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(K).T
     cloud = np.concatenate([rays * sparse[rows, columns, None], [[0.0, 0.0, -1.0]]])
     as_cloud = run(GeometryGuidance.from_points(cloud, K, **FAST))
-    np.testing.assert_allclose(as_cloud.prediction, of_points.prediction, rtol=1e-3)
+    np.testing.assert_allclose(as_cloud.prediction, out.prediction, rtol=1e-3)
     assert as_cloud.warnings == ["1 points lie behind the left camera or outside its image: left out."]
 
 
