@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.cli.inputs import _read_known, lenses_of, read_inputs
+from geodiff_plugin.cli.inputs import lenses_of, read_inputs
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.formats.lenses import distortion_from_text
 from geodiff_plugin.guidance.guidance import GeometryGuidance
@@ -205,16 +205,3 @@ def test_the_estimation_of_poses_is_told_what_it_needs(told_to_estimate, millime
     assert told["known_length"] == pytest.approx(ends, abs=0.01)
     with pytest.raises(InputError, match="--known-length must be between two pixels that the lens shows"):
         told_to_estimate(known_length="0,0,60,40,1", distortion=("-1,0,0,0",))
-
-
-def test_a_map_of_known_depths_goes_through_the_lens(millimetres):
-    known = {"points": millimetres, "points_scale": 1000.0, "device": "cpu"}
-    options = DepthOptions(**VIEWS, **known, **FOUR, baseline=0.12, distortion=(LENS,))
-    inputs = read_inputs(options, options.config())
-    np.testing.assert_allclose(inputs.guidance.inputs[0].points.numpy(), expected_points(), atol=1e-4)
-    lens, K = distortion_from_text(LENS), inputs.rig.K_left
-    with pytest.raises(InputError, match="--points must be a map of .* 32x24 pixels; got 64x48"):
-        _read_known(options, K, lens, (32, 24))
-    Path("points.txt").write_text("0.1 0.2 2\n")
-    listed = DepthOptions(left=Path("left.png"), points=Path("points.txt"))
-    np.testing.assert_allclose(_read_known(listed, K, lens, (64, 48)), [[0.1, 0.2, 2.0]], atol=1e-6)

@@ -91,17 +91,20 @@ def test_fields_become_options_and_those_of_another_way_are_left_out(photographs
     assert turned.estimate_pose and turned.cx == 23.5 and turned.cx_right is None
 
 
-@pytest.mark.parametrize(
-    ("way", "fields", "said"),
-    [
-        ("numbers", {}, "fx and baseline must be given"),
-        ("photographs", {}, "the distance of the cameras must be given"),
-        ("file", {}, "calibration must be a calibration file"),
-    ],
-)
-def test_fields_that_are_missing(way, fields, said, photographs):
-    with pytest.raises(ValueError, match=said):
-        options_of(*photographs, way, **fields)
+def test_what_a_visitor_left_out_or_gave_wrongly(photographs, tmp_path, monkeypatch):
+    (tmp_path / "words.png").write_text("no image")
+    for left, way, said in (
+        (photographs[0], "numbers", "fx and baseline must be given"),
+        (photographs[0], "photographs", "the distance of the cameras must be given"),
+        (photographs[0], "file", "calibration must be a calibration file"),
+        (None, "file", "the left photograph must be given"),
+        (str(tmp_path / "words.png"), "file", "the left photograph must be an image file"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            options_of(left, photographs[1], way)
+    monkeypatch.setattr(job, "MOST_MEGAPIXELS", 0.003)
+    with pytest.raises(ValueError, match="at most 0.003 megapixels; got 64x48"):
+        options_of(*photographs, "file")
 
 
 @pytest.mark.filterwarnings("ignore:.*has no unit")
@@ -208,19 +211,6 @@ def test_settings_that_a_job_refuses(priors, asked, changes, said):
         run(replace(asked, **changes), priors)
 
 
-def test_photographs_that_are_refused(photographs, tmp_path, monkeypatch):
-    (tmp_path / "words.png").write_text("no image")
-    for left, said in (
-        (None, "the left photograph must be given"),
-        (str(tmp_path / "words.png"), "the left photograph must be an image file"),
-    ):
-        with pytest.raises(ValueError, match=said):
-            options_of(left, photographs[1], "file")
-    monkeypatch.setattr(job, "MOST_MEGAPIXELS", 0.003)
-    with pytest.raises(ValueError, match="at most 0.003 megapixels; got 64x48"):
-        options_of(*photographs, "file")
-
-
 def test_without_gradio_it_says_what_to_install(monkeypatch):
     monkeypatch.setattr(launch.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'geodiff-plugin\[app\]'"):
@@ -297,11 +287,3 @@ class TestWithGradio:
         monkeypatch.setattr("signal.signal", ignore)
         with pytest.raises(ValueError, match=r"--port must be free to listen on; got 127.0.0.1 and 8000"):
             launch.run_app(("bundled",), "cpu", "127.0.0.1", 8000, False)
-
-    def test_a_prior_that_cannot_be_loaded_is_told_before_the_page_is_served(self, monkeypatch, tmp_path):
-        from geodiff_plugin.app import page
-
-        monkeypatch.setattr(launch, "_own_folder", ignore)
-        monkeypatch.setattr(page, "build_page", lambda _: pytest.fail("the page was built"))
-        with pytest.raises((OSError, ValueError), match="nosuch"):
-            launch.launch_page((str(tmp_path / "nosuch"),), "cpu")

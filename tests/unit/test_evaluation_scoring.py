@@ -113,14 +113,3 @@ def test_regions_split_by_whether_the_views_match_which_is_found_once_a_sample(m
     away = np.diag([-1.0, 1, -1, 1])
     away[0, 3] = 0.12
     assert set(regions(textured_sample(E=away))) == {"out_of_view"}  # no overlap
-
-
-def test_refusals(monkeypatch):
-    with pytest.raises(ValueError, match="prediction.depth_m must be of the left image's shape"):
-        score(make_sample(), Prediction(np.ones((3, 3))), None)
-    with pytest.raises(ValueError, match="the truth of middlebury2014/a"):
-        score(make_sample(valid=np.zeros(SHAPE, bool)), Prediction(np.ones(SHAPE)), None)
-    monkeypatch.setattr(experiment, "crop_mask", lambda crop, shape: np.arange(shape[1]) > 3)
-    blind = make_sample(valid=np.zeros(SHAPE, bool) | (np.arange(8) < 2))
-    with pytest.raises(ValueError, match="the truth of middlebury2014/a must be known somewhere in the crop"):
-        experiment.cropped(blind, "garg")

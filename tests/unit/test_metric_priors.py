@@ -8,7 +8,6 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.algorithm import settling
 from geodiff_plugin.algorithm.evidence import prepare_evidence
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.runtime.start import PROMPT_LONG_EDGE, depth_prompt
@@ -46,23 +45,6 @@ def test_a_run_says_how_far_the_priors_metres_were_off(kind, textured_plane):
     assert out.own_scale.shape == (1, 1) and float(out.own_scale) == pytest.approx(2.0, rel=0.015)
     assert any("2 times the prior's own metres" in sentence for sentence in out.warnings)
     assert np.median(out.prediction[0, ..., 0] / textured_plane.depth_m) == pytest.approx(1.0, rel=0.01)
-
-
-@pytest.mark.parametrize("kind", ["tipsv2", "depth_pro"])
-def test_the_search_starts_from_the_priors_own_metres(kind, textured_plane, monkeypatch):
-    started, stock = [], settling.search_scale
-
-    def watched(*arguments, current=None, **options):
-        started.append(current)
-        return stock(*arguments, current=current, **options)
-
-    monkeypatch.setattr(settling, "search_scale", watched)
-    out = guided(knowing(kind, textured_plane.depth_m), textured_plane, crisp=False)
-    ends = sorted(float(v) for v in started[0])
-    # One end is the map's 98 % quantile, which lies up to 6.4 % within the range of this plane.
-    assert ends[0] == pytest.approx(textured_plane.depth_m.min(), rel=0.08)
-    assert ends[1] == pytest.approx(textured_plane.depth_m.max(), rel=0.08)
-    assert float(out.own_scale) == pytest.approx(1.0, abs=0.02)
 
 
 def evidence_of(pair, points=None, rights=True):

@@ -7,12 +7,10 @@ import pytest
 import torch
 from diffusers import PNDMScheduler, UNet2DConditionModel
 from diffusers.models.attention_processor import AttnProcessor
-from PIL import Image
 from safetensors.torch import load_file, save_file
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.algorithm.denoising import noise_from, output_from, z0_from
-from geodiff_plugin.algorithm.gradients import RULES, Plain
 from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.priors.components import DirectScheduler, SidesOf
 from geodiff_plugin.priors.depthmaster import DepthMasterPrior
@@ -25,10 +23,8 @@ from tests.conftest import make_unet
 from tests.contracts.tiny_priors import (
     make_depthfm,
     make_depthmaster,
-    make_e2e_ft,
     make_geowizard,
     make_lotus,
-    make_ppd,
     quiet,
 )
 
@@ -96,41 +92,6 @@ def test_plan_of_steps_and_rounds(textured_plane, most, asked, default, planned)
     assert count_steps(guidance.denoising_steps(asked, default), asked, most) == planned
 
 
-@pytest.mark.parametrize(("start", "rounds"), [(0.0, 3), (0.5, 1)])
-def test_one_step_makes_the_updates_of_all(textured_plane, monkeypatch, start, rounds):
-    """3 rounds of 2 updates in the one step; ``start`` leaves out rounds as it would leave out steps."""
-    steps = []
-
-    class Counted(Plain):
-        def step(self, gradient, reference=None):
-            steps.extend([gradient] * (gradient.ndim == 4))  # not those of scale and shift
-            return super().step(gradient, reference)
-
-    monkeypatch.setitem(RULES, "counted", Counted)
-    views = textured_plane.right, textured_plane.K, textured_plane.E
-    knobs = {"inner_steps": 2, "min_steps": 3, "weights": {"photometric": 1.0}}
-    guidance = GeometryGuidance(*views, rule="counted", start=start, **knobs)
-    out = enable_geometry_guidance(make_e2e_ft())(Image.fromarray(textured_plane.left), guidance=guidance)
-    assert len(steps) == 2 * rounds and {report.step for report in out.history} == {0}
-
-
-@pytest.mark.parametrize(
-    ("make", "draws"),
-    [
-        (make_depthmaster, False),
-        (lambda: make_lotus("g"), True),
-        (lambda: make_lotus("d"), True),  # the image latent
-        (make_depthfm, True),
-        (lambda: make_depthfm(noising_step=0), False),
-    ],
-)
-def test_the_generator_decides_what_is_drawn(make, draws):
-    pipe = make()
-    first, again, other = (pipe(IMAGE, generator=seeded(s), output_latent=True).latent for s in (0, 0, 1))
-    assert torch.equal(first, again) and torch.equal(first, other) != draws
-    assert pipe.deterministic != draws
-
-
 @pytest.mark.parametrize("make", [make_geowizard, make_depthfm])
 def test_a_batch_gives_every_member_what_it_gets_alone(make):
     pipe = make()
@@ -142,22 +103,6 @@ def test_a_batch_gives_every_member_what_it_gets_alone(make):
         pipe(x, latents=latents[i : i + 2], **options).latent for x, i in zip(images, (0, 2), strict=True)
     ]
     torch.testing.assert_close(both, torch.cat(alone), atol=1e-4, rtol=1e-4)
-
-
-def test_ppd_in_half_precision_and_with_checkpointing():
-    pipe, gradients = make_ppd(), []
-    image, tokens = torch.rand(1, 3, 32, 48), torch.rand(1, 6, 64)
-    for enabled in (False, True):
-        if enabled:
-            pipe.dit.enable_gradient_checkpointing()
-        z = torch.ones(1, 1, 32, 48, requires_grad=True)
-        output = pipe.dit(torch.cat([z, image], dim=1), tokens, torch.tensor(500.0))
-        gradients.append(torch.autograd.grad(output.square().sum(), z)[0])
-    torch.testing.assert_close(*gradients)
-    assert gradients[0].abs().sum() > 0
-    out = make_ppd().to(torch.bfloat16)(torch.rand(1, 3, 50, 81), output_type="pt", generator=seeded())
-    assert tuple(out.prediction.shape) == (1, 1, 50, 81)
-    assert out.prediction.dtype == torch.float32 and out.prediction.isfinite().all()
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -296,30 +241,3 @@ def test_geowizards_normals_are_unit_vectors_of_one_member():
     towards = torch.tensor([[0.0, 0.0, -1.0], [0.1, 0.0, -1.0], [1.0, 0.0, 0.0]])
     vectors = torch.nn.functional.normalize(towards, dim=1)[:, :, None, None].expand(3, 3, 4, 5)
     assert torch.equal(closest_to_mean(vectors)[0], vectors[1])
-
-
-@pytest.mark.parametrize("gradient", ["denoised", "full"])
-def test_guidance_moves_depth_and_normals_follow_through_attention_alone(gradient, textured_plane):
-    views = textured_plane.right, textured_plane.K, textured_plane.E
-    knobs = {"inner_steps": 1, "step_latents": 1.0, "weights": {"photometric": 1.0}, "respace": False}
-    guidance = GeometryGuidance(*views, gradient=gradient, **knobs)
-
-    def latents_of_every_step(**told):
-        seen, pipe = [], enable_geometry_guidance(make_geowizard(1))
-        own = pipe.scheduler.step
-
-        def step(*args, **kwargs):
-            result = own(*args, **kwargs)
-            seen.append(result.prev_sample)
-            return result
-
-        pipe.scheduler.step = step
-        return seen, pipe(textured_plane.left, num_inference_steps=2, generator=seeded(), **told)
-
-    plain, _ = latents_of_every_step()
-    guided, output = latents_of_every_step(guidance=guidance)
-    depth, normals = slice(0, 4), slice(4, 8)
-    assert not torch.equal(plain[0][:, depth], guided[0][:, depth])
-    torch.testing.assert_close(plain[0][:, normals], guided[0][:, normals], rtol=0.0, atol=1e-6)
-    assert (plain[1][:, normals] - guided[1][:, normals]).abs().max() > 1e-4
-    assert output.extras["normals"].shape == (1, 48, 64, 3)
