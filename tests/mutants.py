@@ -182,9 +182,9 @@ MUTANTS = [
         ("RESIDUAL_CAUCHY = 2.5", "RESIDUAL_CAUCHY = 3.0"),
         ('F.interpolate(error, size, mode="nearest-exact")', 'F.interpolate(error, size, mode="bilinear")'),
         ("INERTIA * ratio**STIFFNESS_POWER", "INERTIA * ratio**3"),
-        tests=(f"{UNIT}known_grids.py", f"{UNIT}correction.py"),
+        tests=(f"{UNIT}evidence.py", f"{UNIT}algorithm.py"),
     ),
-    *of("algorithm/solver.py", ("0.5 * across, 0.5 * down", "across, down"), tests=(f"{UNIT}solver.py",)),
+    *of("algorithm/solver.py", ("0.5 * across, 0.5 * down", "across, down"), tests=(f"{UNIT}algorithm.py",)),
     *of(
         "algorithm/terms.py",
         ("eta * ((1.0 - ssim", "(1.0 - eta) * ((1.0 - ssim"),
@@ -240,7 +240,7 @@ MUTANTS = [
             "matched = warped[:, layer].clone()",
         ),
         ("K_strip[:, 1, 2] -= rows.start", "K_strip[:, 1, 2] -= 0"),
-        tests=(f"{UNIT}confidence.py", f"{UNIT}large_pictures.py"),
+        tests=(f"{UNIT}verdict.py", f"{UNIT}large_pictures.py"),
     ),
     *of(
         "runtime/noise_levels.py",

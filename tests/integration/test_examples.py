@@ -36,7 +36,7 @@ def run(tmp_path, monkeypatch, capsys):
 def test_every_example_is_tested():
     source = Path(__file__).read_text(encoding="utf-8")
     for path in Path(proof.__file__).parent.glob("*.py"):
-        assert f'run("{path.stem}"' in source or path.stem == "fitted_lora"  # test_fitted_lora.py
+        assert f'run("{path.stem}"' in source or path.stem == "fitted_lora"  # test_marigold_v2.py
 
 
 def test_depth_from_stereo(run, prior, pair):

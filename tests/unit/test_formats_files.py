@@ -1,5 +1,7 @@
-"""Depth maps, point clouds and the atomic rename: what is written is read back, by others' code too."""
+"""Maps, clouds, GLB and COLMAP files: written whole, and read back by code of others or of the test."""
 
+import json
+import struct
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -10,16 +12,24 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from geodiff_plugin._checks import InputError
 from geodiff_plugin.formats import (
+    Cloud,
     atomic_path,
     flying_points,
+    make_cloud,
+    read_calibration,
     read_depth_png,
     read_pfm,
+    write_colmap,
     write_depth_mm,
     write_depth_npy,
+    write_glb,
     write_pfm,
     write_ply,
 )
+from geodiff_plugin.formats.sfm import model_files, read_colmap_model, read_colmap_points
+from tests.contracts.calibrations import SAMPLES, choice
 
 TAKE = settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
 SIDES = st.integers(1, 9)
@@ -129,3 +139,138 @@ def test_flying_points_find_a_ramp_between_two_surfaces(angle):
     across = np.cos(np.deg2rad(angle)) * (u - 30) + np.sin(np.deg2rad(angle)) * (v - 30)
     flying = flying_points(np.interp(across, [-1.5, 1.5], [1.0, 4.0]))
     assert flying[np.abs(across) < 1.4].mean() > 0.95 and not flying[np.abs(across) > 3].any()
+
+
+K_60 = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
+C, S = np.cos(0.1), np.sin(0.1)
+E = np.array([[C, 0, S, 0.12], [0, 1, 0, 0], [-S, 0, C, 0], [0, 0, 0, 1]])
+LEFT, EMPTY = (K_60, np.eye(4), (64, 48)), Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+
+
+def parse_glb(path) -> tuple[dict, bytes]:
+    raw = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", raw)
+    assert (magic, version, length) == (b"glTF", 2, len(raw))
+    count, kind = struct.unpack_from("<I4s", raw, 12)
+    assert kind == b"JSON" and count % 4 == 0
+    scene = json.loads(raw[20 : 20 + count])
+    if length == 20 + count:
+        return scene, b""
+    size, kind = struct.unpack_from("<I4s", raw, 20 + count)
+    assert kind == b"BIN\0" and 28 + count + size == length
+    return scene, raw[28 + count :]
+
+
+def accessor(scene: dict, data: bytes, number: int) -> np.ndarray:
+    entry = scene["accessors"][number]
+    view = scene["bufferViews"][entry["bufferView"]]
+    assert view["byteOffset"] % 4 == 0
+    kind = {5126: "<f4", 5121: "u1", 5125: "<u4"}[entry["componentType"]]
+    width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[entry["type"]]
+    raw = data[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    return np.frombuffer(raw, kind).reshape(entry["count"], width)
+
+
+def test_glb_turns_the_axes_and_keeps_colours(tmp_path):
+    cloud = Cloud(np.array([[1.0, -1.0, 1.0], [0, 0, 2]]), np.array([[255, 0, 9], [1, 2, 3]], np.uint8))
+    write_glb(tmp_path / "a.glb", cloud)
+    scene, data = parse_glb(tmp_path / "a.glb")
+    primitive = scene["meshes"][0]["primitives"][0]
+    positions, colours = (primitive["attributes"][name] for name in ("POSITION", "COLOR_0"))
+    assert primitive["mode"] == 0
+    assert accessor(scene, data, positions).tolist() == [[1, 1, -1], [0, 0, -2]]
+    assert accessor(scene, data, colours).tolist() == [[255, 0, 9, 255], [1, 2, 3, 255]]
+    bounds = scene["accessors"][positions]
+    assert bounds["min"] == [0, 0, -2] and bounds["max"] == [1, 1, -1]
+    write_glb(tmp_path / "a.glb", EMPTY)
+    scene, data = parse_glb(tmp_path / "a.glb")
+    assert scene["scenes"] == [{}] and data == b""
+
+
+def test_glb_cameras_look_at_the_cloud(tmp_path):
+    cloud = make_cloud(np.full((48, 64), 2.0), np.zeros((48, 64, 3)), K_60)
+    write_glb(tmp_path / "a.glb", cloud, [LEFT, (K_60, E, (64, 48))])
+    scene, data = parse_glb(tmp_path / "a.glb")
+    assert [mesh["name"] for mesh in scene["meshes"]] == ["cloud", "camera 0", "camera 1"]
+    lines = scene["meshes"][2]["primitives"][0]
+    assert lines["mode"] == 1 and accessor(scene, data, lines["indices"]).max() == 4
+    corners = accessor(scene, data, lines["attributes"]["POSITION"])
+    np.testing.assert_allclose(corners[0], [0.12, 0, 0], atol=1e-6)
+    assert (corners[1:, 2] < 0).all()  # before the camera is -z
+    middle = corners[1:].mean(0) - corners[0]
+    np.testing.assert_allclose(middle / np.linalg.norm(middle), [S, 0, -C], atol=1e-6)
+
+
+def test_colmap_comes_back_through_the_reader(tmp_path):
+    cloud = make_cloud(np.full((48, 64), 2.0), np.full((48, 64, 3), 0.5), K_60)
+    write_colmap(tmp_path, [("left.png", *LEFT), ("right.png", K_60, E, (64, 48))], cloud)
+    rig = read_calibration(tmp_path, image_names=("left.png", "right.png"), baseline_m=0.12)
+    np.testing.assert_allclose(rig.K_left, K_60)
+    np.testing.assert_allclose(rig.E, E, atol=1e-9)
+    assert rig.size_right == (64, 48)
+    lines = [line for line in (tmp_path / "points3D.txt").read_text().splitlines() if line[0] != "#"]
+    assert len(lines) == 48 * 64
+    assert lines[0].split()[3:] == ["2.00000", "128", "128", "128", "0"]
+    with pytest.raises(ValueError, match="without blanks"):
+        write_colmap(tmp_path, [("my left.png", *LEFT)], EMPTY)
+
+
+CAMERAS, IMAGES = SAMPLES["colmap"]
+POINTS = "# 3D point list\n17 1 -2 3.5 10 20 255 0.25 1 0 2 0 3 0\n18 1 -2 4.5 10 20 255 0.25 1 1 3 1\n"
+
+
+def test_a_model_of_many_images_is_read_without_its_points(tmp_path, monkeypatch):
+    """The points of a hundred images exceed what any other calibration has, and no pair needs them."""
+    (tmp_path / "images.bin").write_bytes(b"\0")
+    with pytest.raises(IsADirectoryError, match="got the folder"):
+        read_calibration(tmp_path)
+    monkeypatch.setattr("geodiff_plugin.formats.files.LARGEST_TEXT_BYTES", 20_000)
+    points = " ".join(["512.25 40.5 7", "3 200 -1"] * 3000)
+    (tmp_path / "cameras.txt").write_text(CAMERAS)
+    (tmp_path / "images.txt").write_text(IMAGES.replace("320.5 240.25 17", points))
+    assert read_calibration(tmp_path, **choice("colmap")).E[0, 3] == pytest.approx(0.12)
+    moved = (tmp_path / "images.txt").read_text().replace("rig/right.jpg", "rig/renamed.jpg")
+    (tmp_path / "images.txt").write_text(moved)  # what is remembered is that of the old file
+    with pytest.raises(ValueError, match="one of the 3 in"):
+        read_calibration(tmp_path, **choice("colmap"))
+    (tmp_path / "images.txt").write_text(points)
+    with pytest.raises(ValueError, match="calibration must be a calibration file.*; got .* bytes"):
+        read_calibration(tmp_path, **choice("colmap"))
+
+
+@pytest.fixture
+def models(tmp_path):
+    """Folders of the sample's model in text and in COLMAP's binary, with a point that three images see."""
+    pycolmap = pytest.importorskip("pycolmap")
+    text, binary = tmp_path / "txt", tmp_path / "bin"
+    first, other, right = IMAGES.split("320.5 240.25 17\n")[:3]
+    seen = "320.5 240.25 17", " 30 40 18"  # the second point is not seen by the other image
+    images = f"{first}{seen[0]}{seen[1]}\n{other}{seen[0]}\n{right}{seen[0]}{seen[1]}\n"
+    for folder in (text, binary):
+        folder.mkdir()
+    for name, content in (("cameras", CAMERAS), ("images", images), ("points3D", POINTS)):
+        (text / f"{name}.txt").write_text(content)
+    pycolmap.Reconstruction(str(text)).write_binary(str(binary))
+    return text, binary
+
+
+def test_binary_models_are_those_in_text_and_known_points_are_seen_three_times(models):
+    rigs = [read_calibration(folder, **choice("colmap")) for folder in models]
+    np.testing.assert_array_equal(rigs[0].E, rigs[1].E)
+    np.testing.assert_array_equal([rig.K_left for rig in rigs], [rigs[0].K_left] * 2)
+    (cameras, images), (others, twins) = (read_colmap_model(model_files(folder)) for folder in models)
+    assert cameras.keys() == others.keys() == {1, 2} and cameras[1].size == others[1].size == (640, 480)
+    for name, (number, T, camera) in images.items():
+        assert (number, camera) == (twins[name][0], twins[name][2])
+        np.testing.assert_allclose(T, twins[name][1], atol=1e-12)
+    for folder in models:
+        points = read_colmap_points(folder)
+        assert points.keys() == {1, 2, 3} and all(xyz.tolist() == [[1, -2, 3.5]] for xyz in points.values())
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_a_cut_off_binary_file_is_named(models, name):
+    path = models[1] / name
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(InputError, match=rf"{name} must be a binary COLMAP file; got less.*cut off"):
+        read_colmap_points(models[1]) if name[0] == "p" else read_calibration(models[1], **choice("colmap"))

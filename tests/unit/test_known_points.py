@@ -1,4 +1,4 @@
-"""Known points on the grid of the losses, their confidence, and what contradicts the views."""
+"""Known depths: files of every kind give the same metres; points and their confidence on the grid."""
 
 from dataclasses import replace
 
@@ -9,11 +9,160 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.formats import rig_from_parameters, write_pfm
-from geodiff_plugin.formats.depth import depth_of_disparity
+from geodiff_plugin.formats import read_points, rig_from_parameters, write_depth_mm, write_pfm
+from geodiff_plugin.formats.depth import depth_of_disparity, read_confidence
 from geodiff_plugin.guidance.inputs import as_points
 from geodiff_plugin.matching import points_to_matches, with_points
 from geodiff_plugin.scale.points import depth_span
+
+MAP = np.zeros((6, 8), np.float32)
+MAP[1, 2], MAP[4, 5] = 1.25, 3.5
+POINTS = np.array([[0.1, -0.2, 2.0], [0.4, 0.3, 5.5]], np.float32)
+
+
+def test_maps_of_every_kind_are_the_same(tmp_path):
+    write_depth_mm(tmp_path / "map.png", MAP)
+    write_pfm(tmp_path / "map.pfm", np.where(MAP > 0, MAP, np.inf))
+    np.save(tmp_path / "map.npy", np.where(MAP > 0, MAP, np.nan).astype(np.float64))
+    for name in ("map.png", "map.pfm", "map.npy"):
+        read = read_points(tmp_path / name)
+        assert read.dtype == np.float32
+        np.testing.assert_allclose(read, MAP, atol=5e-4)
+
+
+TEXTS = {
+    "commas": "0.1,-0.2,2.0\n0.4,0.3,5.5\n",
+    "heading": "x,y,z\n0.1, -0.2, 2.0\n0.4, 0.3, 5.5\n",
+    "more columns": "X Y Z intensity\n0.1 -0.2 2.0 .5\n0.4 0.3 5.5 .1\n",
+    "remarks": "# a remark\n0.1;-0.2;2.0\n\n0.4;0.3;5.5 # the last\n",
+    "other order": "id,z,y,x\n0,2.0,-0.2,0.1\n1,5.5,0.3,0.4\n",
+    "words in another column": "label;x[m];y[m];z[m]\ncar;0.1;-0.2;2\ntree;0.4;0.3;5.5\n",
+    "quotes": '"X_m","Y_m","Z_m"\n"0.1","-0.2","2.0"\n"0.4","0.3","5.5"\n',
+    "title": "two points\n0.1 -0.2 2.0\n0.4 0.3 5.5\n",
+    "colours": "//X Y Z R G B\r\n0.1\t-0.2\t2.0\t255\t0\t0\r\n0.4\t0.3\t5.5\t0\t0\t9\r\n",
+}
+
+
+@pytest.mark.parametrize("kind", [*TEXTS, "Windows' shell"])
+def test_text_as_people_have_it(tmp_path, kind):
+    encoding = "utf-8" if kind in TEXTS else "utf-16"
+    (tmp_path / "points.csv").write_text(TEXTS.get(kind, TEXTS["commas"]), encoding=encoding)
+    np.testing.assert_allclose(read_points(tmp_path / "points.csv"), POINTS)
+
+
+PLY = "ply\nformat {kind} 1.0\ncomment by hand\nelement vertex 2\n{properties}{more}end_header\n"
+PROPERTIES = "property double x\nproperty uchar red\nproperty float y\nproperty float z\n"
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_binary_ply(tmp_path, order):
+    mark = "<" if order == "little" else ">"
+    kinds = [("x", "f8"), ("red", "u1"), ("y", "f4"), ("z", "f4")]
+    rows = np.zeros(2, np.dtype([(name, mark + kind) for name, kind in kinds]))
+    for axis, name in enumerate("xyz"):
+        rows[name] = POINTS[:, axis]
+    faces = "element face 1\nproperty list uchar int vertex_indices\n"
+    head = PLY.format(kind=f"binary_{order}_endian", properties=PROPERTIES, more=faces)
+    (tmp_path / "points.ply").write_bytes(head.encode() + rows.tobytes() + b"\x03" + bytes(12))
+    np.testing.assert_allclose(read_points(tmp_path / "points.ply"), POINTS, rtol=1e-6)
+    (tmp_path / "points.ply").write_bytes(head.encode() + rows.tobytes()[:-1])
+    with pytest.raises(ValueError, match="points must be a PLY file with all its 2 points.*cut off"):
+        read_points(tmp_path / "points.ply")
+
+
+def test_ascii_ply(tmp_path):
+    head = PLY.format(kind="ascii", properties=PROPERTIES, more="")
+    (tmp_path / "points.ply").write_text(head + "0.1 255 -0.2 2.0\n0.4 0 0.3 5.5\n")
+    np.testing.assert_allclose(read_points(tmp_path / "points.ply"), POINTS)
+
+
+XYZ = b"property float x\nproperty float y\nproperty float z\n"
+BEGIN = b"ply\nformat ascii 1.0\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("binary.xyz", b"\xff\xfe\x00", "points must be .*metres.*binary.xyz"),
+        ("cube.npy", np.zeros((2, 3, 4)), r"map \(H, W\) or points \(N, 3\)"),
+        ("points.npy", (POINTS * 1000).astype(np.int32), "metres as floats; got .*int32. Divide millimetres"),
+        ("cut.ply", BEGIN + b"element vertex 2\n", "PLY"),
+        ("x.ply", BEGIN + b"element vertex 2\nproperty float x\nend_header\n1\n2\n", "PLY"),
+        ("many.ply", BEGIN + b"element vertex 999999999999\n" + XYZ + b"end_header\n", "PLY"),
+        ("few.ply", BEGIN + b"element vertex 2\n" + XYZ + b"end_header\n1 2 3\n", "PLY .* cut off"),
+    ],
+)
+def test_what_is_none_is_named_with_what_would_be(tmp_path, name, content, said):
+    if isinstance(content, bytes):
+        (tmp_path / name).write_bytes(content)
+    else:
+        np.save(tmp_path / name, content)
+    with pytest.raises(ValueError, match=said):
+        read_points(tmp_path / name)
+
+
+#: The scanner looks along x, its y to the left, z up; the camera sits 0.27 m before it.
+TR = "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 -0.27\n"
+P2 = "700 0 600 70 0 700 180 0 0 0 1 0"
+EYE = "1 0 0 0 1 0 0 0 1"
+
+
+@pytest.fixture
+def scan(tmp_path):
+    """One point 10 m before the scanner and 1 m to the left, one behind it."""
+    rows = np.array([[10.0, 1.0, 0.5, 0.3], [-5.0, 0.0, 0.0, 0.1]], "<f4")
+    (tmp_path / "0.bin").write_bytes(rows.tobytes())
+    return tmp_path / "0.bin"
+
+
+def test_a_velodyne_scan_with_either_calibration(tmp_path, scan):
+    (tmp_path / "object.txt").write_text(f"P2: {P2}\nR0_rect: {EYE}\n{TR}")
+    (tmp_path / "velo.txt").write_text("calib_time: 1-Jan\nR: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 -0.27\n")
+    (tmp_path / "cams.txt").write_text(f"R_rect_00: {EYE}\nP_rect_02: {P2}\n")
+    expected = [[-1.0 + 70 / 700, -0.5, 9.73]]  # camera 2 stands 0.1 m to the left of camera 0
+    for files in ([tmp_path / "object.txt"], [tmp_path / "velo.txt", tmp_path / "cams.txt"]):
+        np.testing.assert_allclose(read_points(scan, calibration=files), expected, rtol=1e-5)
+
+
+def test_a_velodyne_scan_that_cannot_be_placed(tmp_path, scan):
+    calib = tmp_path / "calib.txt"
+    calib.write_text(f"P2: {P2}\n")
+    with pytest.raises(ValueError, match="points-calib must be given with a .bin"):
+        read_points(scan)
+    with pytest.raises(ValueError, match="points-calib must be KITTI's"):
+        read_points(scan, calibration=[calib])
+    with pytest.raises(ValueError, match="points-calib must be given with a velodyne .bin"):
+        read_points(calib, calibration=[calib])
+    scan.write_bytes(scan.read_bytes()[:-3])
+    with pytest.raises(ValueError, match="cut off"):
+        read_points(scan, calibration=[calib])
+
+
+def test_units_by_number(tmp_path):
+    write_depth_mm(tmp_path / "map.png", MAP * 0.256)  # the integers of KITTI's 1/256 m
+    np.testing.assert_allclose(read_points(tmp_path / "map.png", scale=256), MAP, atol=4e-3)
+    np.save(tmp_path / "mm.npy", (1000 * MAP).astype(np.uint16))
+    np.testing.assert_allclose(read_points(tmp_path / "mm.npy", scale=1000), MAP, atol=1e-3)
+    np.save(tmp_path / "points.npy", 1000 * POINTS)
+    np.testing.assert_allclose(read_points(tmp_path / "points.npy", scale=1000), POINTS, rtol=1e-5)
+    with pytest.warns(UserWarning, match="points has depths of 2000 m and more.*--points-scale 1000"):
+        GeometryGuidance.from_points(read_points(tmp_path / "points.npy"), np.eye(3))
+    for scale in (0.0, float("nan")):
+        with pytest.raises(ValueError, match="points-scale must be between"):
+            read_points(tmp_path / "points.npy", scale=scale)
+
+
+def test_confidence_from_files(tmp_path) -> None:
+    values = np.random.default_rng(3).random(MAP.shape).astype(np.float32)
+    np.save(tmp_path / "c.npy", values)
+    write_pfm(tmp_path / "c.pfm", values)
+    Image.fromarray(np.rint(values * 65535).astype(np.uint16)).save(tmp_path / "c.png")
+    for name, atol in (("c.npy", 0), ("c.pfm", 0), ("c.png", 1e-5)):
+        np.testing.assert_allclose(read_confidence(tmp_path / name), values, atol=atol)
+    Image.new("RGB", (64, 48)).save(tmp_path / "rgb.png")
+    with pytest.raises(ValueError, match="a grey PNG of 8 or 16 bits"):
+        read_confidence(tmp_path / "rgb.png")
+
 
 K = torch.tensor([[60.0, 0, 31.5], [0, 66.0, 23.5], [0, 0, 1]])
 SIZE, GRID = (48, 64), (24, 32)

@@ -1,7 +1,4 @@
-"""Maps of every prior with random weights, plain and guided, against stored ones.
-
-``python -m tests.unit.test_prior_outputs`` stores them anew.
-"""
+"""Maps of every tiny prior are the stored ones, and the memory of networks is counted."""
 
 from pathlib import Path
 
@@ -12,6 +9,8 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.priors import PRIORS
+from tests.benchmarks.full_sizes import FULL_SIZES
+from tests.benchmarks.memory import count_memory
 from tests.conftest import plane_pair
 from tests.contracts.tiny_priors import CALL, TINY
 
@@ -42,3 +41,14 @@ def test_maps_are_the_stored_ones(key, textured_plane):
 
 if __name__ == "__main__":
     np.savez_compressed(FILE, **{k: v for key in TINY for k, v in outputs(key, plane_pair()).items()})
+
+
+@pytest.mark.parametrize("key", [pytest.param("marigold", marks=pytest.mark.slow), "depthmaster"])
+def test_gradients_cost_memory(key, monkeypatch):
+    monkeypatch.setitem(FULL_SIZES, key, TINY[key])
+    assert set(FULL_SIZES) == set(PRIORS) - {"map"}  # which has no network
+    found, parts = count_memory(key), TINY[key]().components.values()
+    real = sum(p.numel() for m in parts if isinstance(m, torch.nn.Module) for p in m.parameters())
+    assert found.parameters == real and found.weights == 2 * real  # bfloat16
+    assert 0 < found.plain < found.denoised
+    assert found.full is None if key == "depthmaster" else found.full > found.denoised
