@@ -91,27 +91,19 @@ def run_experiment(
     remarks: Callable[[list[Record]], Sequence[str]] = lambda records: (),
     journal: str = "",
 ) -> Page | None:
-    """Measure the cells that have no record yet, and write the page.
+    """Measure the cells that have no record yet, and write the page; ``None`` in any process but the first.
 
     The payload of each cell is a ``partial`` that returns the body of its record. Tables, and remarks above
-    them, are of the records of all cells, in their order. ``journal`` is ``<command>.jsonl`` by default.
-
-    Returns:
-        The page; ``None`` in every process but the first.
-
-    Raises:
-        ValueError: bad options, or a broken sample without ``skip_broken``.
-        OSError: missing or unreadable files, likewise.
+    them, are of the records of all cells, in order. ``ValueError`` or ``OSError`` for bad options or samples.
     """
     records = measure_cells(cells, options, journal or f"{command}.jsonl")
     return None if records is None else write_page(command, options, title, tables(records), remarks(records))
 
 
 def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NAME) -> list[Record] | None:
-    """The records of cells, in order; ``None`` in every process but the first.
+    """The records of cells, in order, each with the ``head`` of its cell; ``None`` as ``run_experiment``.
 
-    A cell that stands several times, or under several names (``guided@bundled`` beside ``guided``), is
-    measured once; a record has the ``head`` of its cell, whichever of them it was made for.
+    A cell that stands several times, or under several names, is measured once.
     """
     runner = Runner(
         list({cell.key: cell for cell in cells}.values()),
@@ -130,9 +122,7 @@ def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NA
 def cell_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior: str = "") -> str:
     """Name of a result: the same inputs give the same key, anything else another.
 
-    Of the sample, not where its files lie but what is in them counts, and its other entries (cameras, views);
-    of a folder the files in it that the sample names as well. ``configuration`` is all that changes the
-    method's result beside the prior, ``prior`` that one's name and fingerprint.
+    Not where a sample's files lie but what is in them counts. ``prior`` is its name and fingerprint.
     """
     files = {name: value for name, value in ref.files.items() if value is not None}
     return fingerprint(method, configuration, prior, __version__, ref.dataset, ref.name, files)

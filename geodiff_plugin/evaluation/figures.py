@@ -198,18 +198,11 @@ CANDIDATES, ETA, SHOWN = 80, 0.85, 4
 def sweep_g_s(
     sample: StereoSample, relative: np.ndarray, space: str, largest_m: float
 ) -> tuple[dict[str, np.ndarray], dict[int, np.ndarray]]:
-    """Scale a relative map by every candidate: ``x = g_s * x_rel``, without shift.
+    """Scale a relative map ``(H, W)``, affine in ``space``, by candidates from 1 m to ``largest_m`` (S7.3).
 
-    A map that falls with depth has no depth at 0 without a shift: it gets that of raw scale and shift 0.
-
-    ``relative`` is ``(H, W)``, about [0, 1], affine in ``space``; candidates go from 1 m to ``largest_m``.
-
-    Returns:
-        ``(M,)`` each: ``g_s_m`` metres, ``loss`` (Eq. 14) over the ``visible`` share of pixels, ``abs_rel``;
-        and by index some ``(H, W, 3)`` left images in [0, 1], re-rendered from the right one.
-
-    Source: S7.3. Deviation: L_geo is the mean over the visible pixels, not over all
-    (docs/reference/paper-map.md, E8).
+    Without shift; a map that falls with depth gets that of raw scale and shift 0. Returned are ``(M,)`` each:
+    ``g_s_m`` metres, ``loss`` (Eq. 14) over the ``visible`` share of pixels (docs/reference/paper-map.md,
+    E8), ``abs_rel``; and by index some ``(H, W, 3)`` left images in [0, 1], re-rendered from the right one.
     """
     left, right = (as_image_01(image, "image")[None] for image in (sample.left, sample.right))
     matrices = (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
@@ -293,11 +286,7 @@ def orbit(centre_m: float) -> np.ndarray:
 def render_cloud(
     depth_m: np.ndarray, image: np.ndarray, K: np.ndarray, T_view_from_left: np.ndarray
 ) -> np.ndarray:
-    """Points of a depth map, in the colours of its image, from another camera, the nearest in every pixel.
-
-    Returns:
-        ``(H', W', 3)`` uint8, ``SHRINK`` times the size, white where no point lies.
-    """
+    """Points of a depth map, in the colours of its image, from another camera: uint8, ``SHRINK`` as large."""
     height, width = depth_m.shape
     size = (round(height * SHRINK), round(width * SHRINK))
     known = np.isfinite(depth_m) & (depth_m > 0)
@@ -376,12 +365,7 @@ FIGURES: dict[str, Callable[[FigureOptions], Drawing]] = {
 
 
 def run_figure(name: str, options: FigureOptions) -> Path:
-    """Draw the figure ``options.name``, write it as PNG and its numbers as JSON, and return the PNG's path.
-
-    Raises:
-        ValueError: an unknown figure, no samples, bad options.
-        OSError: missing or unreadable files.
-    """
+    """Draw the figure ``options.name``, write it as PNG and its numbers as JSON; the PNG's path."""
     figure, numbers = FIGURES[check_choice(options.name, "the figure", FIGURES)](options)
     path = options.out / f"figure-{options.name}.png"
     _save_png(figure, path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from functools import lru_cache, partial
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -35,10 +35,10 @@ RIGHT_M, CELL_M = 0.05, 0.02
 
 
 def flicker(errors: Sequence[np.ndarray], truth: Sequence[DepthFrame]) -> tuple[float, float]:
-    """Change of log depth of the same surface points from frame to frame, beyond that of the truth.
+    """Mean absolute change of log depth of the same surface points from frame to frame, beyond the truth's.
 
-    ``errors`` are ``(H, W)`` each, log of depth over truth. The mean absolute change over points, and over
-    frames the mean absolute change of the median: how far the whole picture breathes.
+    ``errors`` are ``(H, W)`` each, log of depth over truth. The second number is that of the frames' medians:
+    how far the whole picture breathes.
     """
     points, breath = [], []
     for (frame, following), (before, after) in zip(pairwise(truth), pairwise(errors), strict=True):
@@ -73,16 +73,13 @@ def run_sequence(name: str, options: SequenceOptions) -> Page | None:
         return SEQUENCES["synthetic"](seed, options.frames, size=options.size)
 
     cells = []
-    for seed in range(options.scenes):
-        for way in options.ways:
-            how = (options.frames, *options.size, options.steps, options.seed, settings.device)
-            key = "|".join(map(str, (seed, way, *how, settings.prior, prior, __version__)))
-            work = partial(_measure_sequence, pipe, render, seed, way, options, store)
-            cells.append(Item(key, work, name=f"sequence {seed}, {way}", head={"seed": seed, "way": way}))
-    remark = (
-        f"{options.scenes} rendered scenes of {options.frames} frames, {options.size[1]}x{options.size[0]} "
-        f"pixels, prior {settings.prior}, {options.steps} steps, seed {options.seed} for every frame."
-    )
+    for seed, way in product(range(options.scenes), options.ways):
+        how = (options.frames, *options.size, options.steps, options.seed, settings.device)
+        key = "|".join(map(str, (seed, way, *how, settings.prior, prior, __version__)))
+        work = partial(_measure_sequence, pipe, render, seed, way, options, store)
+        cells.append(Item(key, work, name=f"sequence {seed}, {way}", head={"seed": seed, "way": way}))
+    of = f"{options.frames} frames, {options.size[1]}x{options.size[0]} pixels, prior {settings.prior}"
+    remark = f"{options.scenes} rendered scenes of {of}, {options.steps} steps, seed {options.seed} each."
     return run_experiment(name, options, "Sequences", cells, sequence_tables, lambda _: [remark])
 
 
@@ -110,9 +107,8 @@ def _measure_sequence(
         scores.append(evaluate_depth(depth_m, true.depth, np.isfinite(true.depth))["abs_rel"])
         errors.append(np.log(depth_m / true.depth))
     moved, breath = flicker(errors, truth)
-    numbers = {"abs_rel": float(np.mean(scores)), "worst": float(np.max(scores))}
-    numbers |= {"flicker": moved, "breath": breath, "seconds": seconds / len(truth)}
-    return {"kind": sequence.kind} | numbers
+    numbers = {"abs_rel": float(np.mean(scores)), "worst": float(np.max(scores)), "flicker": moved}
+    return {"kind": sequence.kind} | numbers | {"breath": breath, "seconds": seconds / len(truth)}
 
 
 _SEQUENCE_COLUMNS: dict[str, CellOf] = {
@@ -128,10 +124,9 @@ _SEQUENCE_COLUMNS: dict[str, CellOf] = {
 def sequence_tables(records: Sequence[Record]) -> list[Table]:
     """Ways by means over the sequences."""
     note = (
-        "AbsRel in metres, without alignment, and that of the worst frame. Flicker: mean absolute change of "
-        "log depth of the same surface point from one frame to the next, beyond that of the truth, in per "
-        "cent; breathing: the same of the frame's median. Seconds of a guided call whose evidence is there "
-        "already; on a CPU those of all its threads."
+        "AbsRel in metres, without alignment. Flicker: mean absolute change of log depth of the same surface "
+        "point from one frame to the next, beyond that of the truth, in per cent; breathing: the same of the "
+        "frame's median. Seconds of a guided call without its evidence; on a CPU those of all its threads."
     )
     return [table_of_groups("From frame to frame", records, ("way",), _SEQUENCE_COLUMNS, note)]
 
@@ -199,23 +194,20 @@ def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
         titles[str(data)] = f"{data.name}, {len(names)} frames"
         pipe = priors.get(settings)
         how = (str(data.resolve()), names, options.prior, priors.fingerprint(settings), options.steps)
-        for row in options.rows:
+        for row, count in product(options.rows, options.neighbours):
             title, poses, _ = CAPTURE_ROWS[row]
-            for count in options.neighbours:
-                work = partial(_measure_frames, captures[poses], pipe, row, count, names, options)
-                head = {"data": str(data), "row": title, "views": str(1 + count)}
-                key = fingerprint(row, count, options.seed, __version__, *how)
-                cells.append(Item(key, work, name=f"{data.name}, {row}, {1 + count} views", head=head))
+            work = partial(_measure_frames, captures[poses], pipe, row, count, names, options)
+            head = {"data": str(data), "row": title, "views": str(1 + count)}
+            key = fingerprint(row, count, options.seed, __version__, *how)
+            cells.append(Item(key, work, name=f"{data.name}, {row}, {1 + count} views", head=head))
         head = {"data": str(data), "row": "COLMAP's sparse points", "views": "all"}
         work = partial(_of_points, captures["refined"], names)
         key = fingerprint("points", __version__, *how)
         cells.append(Item(key, work, name=f"{data.name}, sparse points", head=head))
 
     def tables(records: list[Record]) -> list[Table]:
-        return [
-            table_of_groups(titles[data], own, ("key",), _CAPTURE_COLUMNS)
-            for data, own in grouped(records, "data").items()
-        ]
+        captures = grouped(records, "data").items()
+        return [table_of_groups(titles[data], own, ("key",), _CAPTURE_COLUMNS) for data, own in captures]
 
     return run_experiment(name, options, "Captures", cells, tables, lambda _: (CAPTURE_NOTE,))
 
@@ -238,14 +230,12 @@ def _measure_frames(
         true_frames.append(DepthFrame(name, truth, np.ones_like(depth), solved.K[i], solved.E[i]))
         known.append(valid)
     together = [agreed(frame, [other for other in frames if other is not frame]) for frame in frames]
-    depths = ([frame.depth for frame in which] for which in (frames, together, true_frames))
-    scores, agreed_scores = [], []
-    for depth, checked, truth, mask in zip(*depths, known, strict=True):
-        scores.append(_scores(depth, truth, mask))
-        agreed_scores.append(_scores(checked, truth, mask))
+    scores, checked = (
+        _means([_scores(f.depth, t.depth, k) for f, t, k in zip(which, true_frames, known, strict=True)])
+        for which in (frames, together)
+    )
     f = f_score(_thin(together, known), _thin(true_frames, known))
-    more = {"agreed": _means(agreed_scores)["abs_rel"], "f": f, "tae": temporal_error(together)}
-    return _means(scores) | more
+    return scores | {"agreed": checked["abs_rel"], "f": f, "tae": temporal_error(together)}
 
 
 def _thin(frames: Sequence[DepthFrame], known: Sequence[np.ndarray]) -> np.ndarray:
@@ -269,8 +259,7 @@ def _of_points(capture: Capture, names: Sequence[str]) -> Record:
 
 
 def _scores(depth: np.ndarray, truth: np.ndarray, known: np.ndarray) -> dict[str, float]:
-    scores = evaluate_depth(depth, truth, known)
-    ratio = depth[known] / truth[known]
+    scores, ratio = evaluate_depth(depth, truth, known), depth[known] / truth[known]
     scale = float(np.median(ratio))
     scaled = {"scaled": float(np.mean(np.abs(ratio / scale - 1))), "scale": scale}
     within = {"delta_103": float((np.maximum(ratio, 1 / ratio) < 1.03).mean()), "delta_125": scores["delta1"]}

@@ -50,11 +50,7 @@ def _check_maps(**maps: np.ndarray) -> None:
 
 
 def counted(truth_m: np.ndarray, valid: np.ndarray, cap_m: float | None = None) -> np.ndarray:
-    """``(H, W)`` bool: pixels whose truth is known and strictly between ``FLOOR_M`` and the cap, if any.
-
-    Raises:
-        ValueError: shapes differ, or no pixel is left.
-    """
+    """``(H, W)`` bool: pixels whose truth is known and between ``FLOOR_M`` and any cap; at least one."""
     _check_maps(truth_m=truth_m, valid=valid)
     kept = valid & np.isfinite(truth_m) & (truth_m > FLOOR_M) & (True if cap_m is None else truth_m < cap_m)
     if not kept.any():
@@ -67,14 +63,9 @@ def evaluate_depth(
 ) -> dict[str, float]:
     """Errors of one depth map; truth from ``cap_m`` on is dropped, and predictions are clipped to it.
 
-    Returns:
-        ``DEPTH_METRICS`` over the pixels with both truth and prediction, NaN where there is none;
-        ``coverage`` (share of the truth's pixels with a prediction) and ``pixels`` (their number).
-
-    Raises:
-        ValueError: shapes differ, or no pixel has truth.
-
-    Source: S5.1; Marigold's evaluation code for clipping and SILog.
+    ``DEPTH_METRICS`` over the pixels with both truth and prediction, NaN where there is none; ``coverage``
+    (share of the truth's pixels with a prediction) and ``pixels`` (their number). ``ValueError`` where shapes
+    differ or no pixel has truth. Source: S5.1; Marigold's evaluation code for clipping and SILog.
     """
     _check_maps(pred_m=pred_m, truth_m=truth_m)
     kept = counted(truth_m, valid, cap_m)
@@ -93,12 +84,7 @@ def evaluate_disparity(
     """``DISPARITY_METRICS`` of a disparity map, pixels; NaN without a pixel with truth and prediction.
 
     ``step_px`` is the distance between two neighbouring values that the truth can take: a metric whose
-    threshold is finer is ``None``.
-
-    Raises:
-        ValueError: shapes differ, or no pixel has truth.
-
-    Source: KITTI 2015 development kit (D1), Middlebury (bad-k).
+    threshold is finer is ``None``. Source: KITTI 2015 development kit (D1), Middlebury (bad-k).
     """
     _check_maps(pred_px=pred_px, truth_px=truth_px, valid=valid)
     if not valid.any():
@@ -131,12 +117,7 @@ def ause(
     without the worst ones, and the difference is averaged over k. ``uncertainty`` is ``(H, W)``, any unit,
     larger is less certain; ``None``: the mean over random ones.
 
-    Returns:
-        In AbsRel's unit, at least 0; 0 where the order of the pixels is that of their errors.
-
-    Raises:
-        ValueError: shapes differ, or no pixel has truth, prediction and uncertainty.
-
+    ``ValueError`` where no pixel has truth, prediction and uncertainty.
     Source: Ilg et al., "Uncertainty Estimates and Multi-Hypotheses Networks for Optical Flow", S5.
     """
     known = truth_m if uncertainty is None else uncertainty
@@ -159,9 +140,8 @@ def confidence_deciles(
 ) -> list[dict[str, float | None]]:
     """What a confidence in [0, 1], that the relative error is below ``within``, promises and what it keeps.
 
-    Returns:
-        Ten entries, from [0, 0.1) to [0.9, 1]: ``share`` of the pixels, mean ``promised``, ``kept`` (share of
-        pixels within), ``abs_rel``; the last three ``None`` for an empty class.
+    Ten entries, from [0, 0.1) to [0.9, 1]: ``share`` of the pixels, mean ``promised``, ``kept`` (share of
+    pixels within), ``abs_rel``; the last three ``None`` for an empty class.
     """
     _check_maps(pred_m=pred_m, truth_m=truth_m, valid=valid, confidence=confidence)
     used = valid & np.isfinite(pred_m) & (pred_m > 0)
@@ -219,9 +199,6 @@ def crop_mask(name: str, size: tuple[int, int]) -> np.ndarray:
     Of 375 x 1242 pixels, Garg's crop keeps rows 153 to 370 and columns 44 to 1196, Eigen's rows 124 to 341
     and the same columns, the benchmark's rows 23 to 374 and columns 13 to 1228 (bottom, middle).
 
-    Raises:
-        ValueError: an unknown name, or an image smaller than the benchmark's.
-
     Source: Marigold's evaluation of KITTI, which follows BTS and monodepth. Deviation: Marigold's tables take
         Eigen's crop of an image that was cut to the benchmark's before; here each stands alone.
     """
@@ -265,10 +242,9 @@ def near_disparity_steps(disparity_px: np.ndarray, valid: np.ndarray) -> np.ndar
 
 
 def hidden_by_truth(disparity_px: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """``(H, W)`` bool: pixels of dense truth hidden in the right view of a rectified pair.
+    """``(H, W)`` bool: pixels of dense truth onto whose place in the right image a nearer one falls.
 
-    Another pixel of the row, nearer by more than 1 px of disparity, falls onto the same column of the right
-    image; pixels that fall beside the image are none.
+    Nearer is by more than 1 px of disparity; pixels that fall beside the image are none.
     """
     target = np.rint(np.arange(valid.shape[1]) - np.where(valid, disparity_px, 0.0)).astype(int)
     rows, columns = np.nonzero(valid & (target >= 0) & (target < valid.shape[1]))

@@ -79,6 +79,15 @@ class OutOptions:
     def __post_init__(self) -> None:
         check_options(self)
 
+    @property
+    def settings(self) -> Settings:
+        """What methods are given; imports torch."""
+        from geodiff_plugin.evaluation.baselines import Settings
+        from geodiff_plugin.runtime.machine import pick_device
+
+        given = {each.name: getattr(self, each.name, each.default) for each in fields(Settings)}
+        return Settings(**given | {"device": str(pick_device(given["device"]))})
+
 
 @dataclass(frozen=True, kw_only=True)
 class EvalOptions(OutOptions):
@@ -89,19 +98,9 @@ class EvalOptions(OutOptions):
     dtype: str = declare("float32", f"{', '.join(DTYPES)}.", choices=DTYPES)
     device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
 
-    @property
-    def settings(self) -> Settings:
-        """What methods are given; imports torch."""
-        from geodiff_plugin.evaluation.baselines import Settings
-        from geodiff_plugin.runtime.machine import pick_device
-
-        names = ("ensemble", "seed", "steps", "resolution", "dtype", "space", "views")
-        given = {name: getattr(self, name) for name in names if hasattr(self, name)}
-        return Settings(self.prior, device=str(pick_device(self.device)), **given)
-
 
 @dataclass(frozen=True, kw_only=True)
-class _SampleOptions(EvalOptions):
+class SampleOptions(EvalOptions):
     """Which samples, of what data."""
 
     data: Path | None = _dir("Folder with data sets, or the name of a registered set.")
@@ -116,7 +115,7 @@ class _SampleOptions(EvalOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairsOptions(_SampleOptions):
+class PairsOptions(SampleOptions):
     """``geodiff eval pairs``, and without a few the tables of the paper, of parts, flatness and cost."""
 
     sample: int | None = _count(None, "Draw this many samples at random, by --seed.")
@@ -136,7 +135,7 @@ class DirOptions(PairsOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FigureOptions(_SampleOptions):
+class FigureOptions(SampleOptions):
     """``geodiff eval figure NAME``."""
 
     name: str = declare(MISSING, f"{', '.join(FIGURES)}.", "", metavar="NAME")
@@ -252,18 +251,16 @@ COMMANDS: dict[str, Command] = {
 
 def command_line(name: str, options: Any) -> str:
     """The command line that gives these options, defaults and what changes no number left out."""
-    words = ["geodiff", "eval", name]
+    words, without = ["geodiff", "eval", name], ("out", "results", "quiet", "skip_broken", "save_depth")
     for each in fields(options):
-        value = getattr(options, each.name)
-        changes_nothing = each.name in ("out", "results", "quiet", "skip_broken", "save_depth")
-        if not each.metadata or changes_nothing or value == each.default:
+        value, rules = getattr(options, each.name), each.metadata
+        if not rules or each.name in without or value == each.default:
             continue
-        flag = [flag_of(each)] if each.metadata["flags"] != ("",) else []
-        entries = value if isinstance(value, tuple) else (value,)
-        if isinstance(value, tuple) and each.metadata["split"]:
-            entries = (",".join(map(str, value)),)
+        flag = [flag_of(each)] if rules["flags"] != ("",) else []
+        entries = value if isinstance(value, tuple) and not rules["split"] else (value,)
         for entry in entries:
-            words += flag + ([] if entry is True else [str(entry)])
+            text = ",".join(map(str, entry)) if isinstance(entry, tuple) else str(entry)
+            words += flag + ([] if entry is True else [text])
     return shlex.join(words)
 
 
@@ -274,7 +271,7 @@ def data_of(options: Any) -> Path:
     return options.data or PRIOR_FOLDER.parent / "pair"
 
 
-def all_refs(options: PairsOptions | FigureOptions, datasets: Sequence[str] = ()) -> list[SampleRef]:
+def all_refs(options: SampleOptions, datasets: Sequence[str] = ()) -> list[SampleRef]:
     """References to all samples of the data: of the named data sets, else of those that the options name."""
     from geodiff_plugin.evaluation.datasets import find_pairs
 
@@ -312,7 +309,7 @@ def real_and_rendered(options: RealOptions, text: str) -> tuple[list[SampleRef],
     return real[: options.limit], rendered
 
 
-def select(options: PairsOptions | FigureOptions, refs: Sequence[SampleRef] | None = None) -> list[SampleRef]:
+def select(options: SampleOptions, refs: Sequence[SampleRef] | None = None) -> list[SampleRef]:
     """Of all samples or ``refs``: those that ``scenes`` names, ``sample`` drawn of them, the first ``limit``.
 
     Their poses are given wrongly where ``perturb`` says so.

@@ -21,10 +21,9 @@ from geodiff_plugin.runner import Record
 
 
 class Column(NamedTuple):
-    """One data set of a table, and what stands for it.
+    """One data set of a table, of ``full_count`` pairs in the paper.
 
-    The first of ``datasets`` that is there is the ``dataset`` that is measured, on ``labels``; the paper used
-    ``full_count`` pairs.
+    The first of ``datasets`` that is there is the ``dataset`` that is measured, on ``labels``.
     """
 
     title: str
@@ -53,14 +52,10 @@ class Column(NamedTuple):
 
 
 class PaperRow(NamedTuple):
-    """One row of a table.
+    """One row of a table, predictions ``aligned`` with the truth or not; ``published`` by the column's title.
 
-    Attributes:
-        title: as in the paper; a dagger marks its own metric result.
-        aligned: whether predictions are aligned with the truth.
-        method: a name that ``find_method`` knows; ``hf:Intel/dpt-large`` and ``files:DIR/unidepth`` stand for
-            every method that has the first word of their last part, ``dpt``, after its colon.
-        published: by the column's title, the cells as printed; a dash where the paper has none.
+    A ``method`` such as ``hf:Intel/dpt-large`` or ``files:DIR/unidepth`` stands for every one that has the
+    first word of its last part, ``dpt``, after its colon.
     """
 
     title: str

@@ -39,10 +39,9 @@ def out_of_view(sample: StereoSample) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def matched(sample: StereoSample) -> np.ndarray | None:
-    """``(H, W)`` bool: pixels where our plane sweep of the two views has a reliable match.
+    """``(H, W)`` bool: pixels where our plane sweep of the two views has a reliable match, by the true poses.
 
-    No method, prior or truth has a part in it, and poses are the true ones. Kept until another sample object
-    comes, and made on the CPU, so that no two runs differ. ``None`` where the views cannot be swept.
+    Made on the CPU, so that no two runs differ. ``None`` where the views cannot be swept.
     """
     try:
         volume = sweep(replace(sample, E=sample.E_scored), "cpu")
@@ -56,9 +55,8 @@ def matched(sample: StereoSample) -> np.ndarray | None:
 def regions(sample: StereoSample) -> dict[str, np.ndarray]:
     """Masks by which AbsRel is split, ``(H, W)`` bool, within ``sample.valid``.
 
-    ``out_of_view`` always; ``matched`` and ``unmatched`` (the others) where the two views can be swept;
-    ``visible`` and ``occluded`` where the set says what is hidden; where it has material classes, ``tom``
-    (transparent or mirror), ``not_tom`` (the others) and one ``material_<class>`` per class.
+    ``out_of_view`` always; ``matched`` and ``unmatched`` where the two views can be swept; ``visible`` and
+    ``occluded`` where the set says what is hidden; of material classes ``tom``, ``not_tom``, and each one.
     """
     masks = {"out_of_view": out_of_view(sample)}
     by_match = matched(sample)
@@ -89,8 +87,7 @@ def _positive(depth_m: np.ndarray | None) -> np.ndarray:
 def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, Scores]:
     """``DISPARITY_METRICS`` of a rectified sample, of ``all`` pixels with truth and by region.
 
-    ``visible``: neither hidden in the right view nor outside of it, by the set's mask or by dense truth, left
-    out where nothing says what is hidden; ``edge`` and ``flat``: near a step of the true disparity, and not.
+    ``visible``: by the set's mask or by dense truth; ``edge`` and ``flat``: near its steps, and not.
     """
     cameras, valid = (sample.K_left, sample.K_right, sample.E_scored), sample.valid
     true_px = depth_to_disparity(np.where(valid, sample.depth_m, 1.0), *cameras)
@@ -143,19 +140,13 @@ def in_metres(prediction: Prediction, truth: np.ndarray, kept: np.ndarray) -> np
 
 
 def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> dict[str, Any]:
-    """Score one prediction.
+    """Score one prediction; truth from ``cap_m`` metres on does not count under the cap.
 
-    ``cap_m`` is the farthest truth that counts in the data set's protocol, metres, ``None`` for no limit.
-
-    Returns:
-        ``all_pixels``: ``raw`` and ``aligned`` errors over every pixel with truth; ``capped``: the same under
-        the cap; ``disparity`` of rectified pairs, not aligned, with its ``regions``; ``regions``: AbsRel by
-        region under the cap, not aligned (aligned for a method without metres); ``ause`` of the uncertainty;
-        ``confidence`` by decile, and ``ause_confidence``: its AUSE, and that of a random order;
-        ``boundaries`` of dense truth: ``f1``, ``dbe_acc``, ``dbe_comp``. ``None`` where it does not apply.
-
-    Raises:
-        ValueError: a map of the wrong shape, or a sample without truth.
+    ``all_pixels``: ``raw`` and ``aligned`` errors over every pixel with truth; ``capped``: the same under the
+    cap; ``regions``: AbsRel by region under the cap, aligned for a method without metres; of metres
+    ``disparity`` of rectified pairs, ``ause`` of the uncertainty, ``confidence`` by decile,
+    ``ause_confidence`` and that of a random order, ``boundaries`` of dense truth. ``None`` where it does not
+    apply; ``ValueError`` for a map of the wrong shape or a sample without truth.
     """
     truth, valid = sample.depth_m, sample.valid
     for name in ("depth_m", "relative", "uncertainty", "confidence"):

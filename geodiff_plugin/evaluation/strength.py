@@ -64,17 +64,13 @@ SMOOTH, SEGMENTS, BLUR = 0.12, 0.16, 0.012
 ORACLE, SHOWN = "prior-aligned", "5%"
 
 
-Strength = tuple[float, bool, float]
-"""A value of ``STRENGTHS``."""
+Strength = tuple[float, bool, float]  # a value of ``STRENGTHS``
 
 
 def relative_map(sample: StereoSample, strength: Strength, space: str, seed: int = 0) -> np.ndarray:
-    """The map of a prior that errs in a given way, at the truth's resolution.
+    """``(H, W)`` float64, the map of a prior that errs in a given way, the same error in every space.
 
-    Holes of the truth take the nearest known depth; one ``seed`` gives the same error in every space.
-
-    Returns:
-        ``(H, W)`` float64, 0 and 1 at the 2 % and 98 % quantiles, clipped there as trained maps are.
+    0 and 1 are at the 2 % and 98 % quantiles, where it is clipped as trained maps are.
     """
     nearest = ndimage.distance_transform_edt(~sample.valid, return_distances=False, return_indices=True)
     log_depth = np.log(sample.depth_m[tuple(nearest)].astype(np.float64))
@@ -106,7 +102,7 @@ def _error(log_depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         best[closer], label[closer] = away[closer], k
     segments = rng.normal(size=seeds)[label]
     field = sum(part / max(float(part.std()), 1e-9) for part in (smooth, segments))
-    field = field - np.median(field)
+    field -= np.median(field)
     return field / max(float(np.abs(field).mean()), 1e-9)
 
 
@@ -126,13 +122,12 @@ class _Denoiser(ModelMixin, ConfigMixin):
         assert self.code is not None  # set by ``EmulatedPrior.answer``
         z_t = sample[:, -self.code.shape[1] :].float()
         level = noise_level(self.scheduler, timestep)
-        own = self.code.expand_as(z_t)
+        z0 = self.code.expand_as(z_t)
         starts = self._last is None or timestep >= self._last  # a schedule falls, so this one is new
         self._last = timestep
-        z0 = own
         if not starts and self._noise is not None:
             implied = (z_t - level.sigma * self._noise) / level.alpha
-            z0 = (1.0 - self.config.follow) * own + self.config.follow * implied
+            z0 = (1.0 - self.config.follow) * z0 + self.config.follow * implied
         self._noise = (z_t - level.alpha * z0) / level.sigma  # what its input holds beside that
         return (output_from(z0, self._noise, level)[0].to(sample.dtype),)
 
@@ -140,9 +135,7 @@ class _Denoiser(ModelMixin, ConfigMixin):
 class EmulatedPrior(PriorCache):
     """The bundled pipeline with an emulated network, guided, for every method that asks for a prior.
 
-    Args:
-        space: what its maps are affine in: disparity, depth or log.
-        follow: how far its later answers follow their input, [0, 1].
+    Its maps are affine in ``space``; its later answers ``follow`` their input by so much, [0, 1].
     """
 
     def __init__(self, space: str = "disparity", follow: float = 0.3) -> None:
@@ -176,15 +169,11 @@ def _depth_m(
     prior.answer(sample, STRENGTHS[strength], options.resolution, options.seed)
     method = find_method(name)
     try:
-        prediction = method.run(sample, method.own_settings(_settings(options)), prior)
+        prediction = method.run(sample, method.own_settings(options.settings), prior)
     except NotApplicable as reason:
         got = f"{name}, not on {sample.label}: {reason}"
         bad_value("--methods", "methods that work on every pair", got)
     return in_metres(prediction, sample.depth_m, sample.valid)
-
-
-def _settings(options: StrengthOptions) -> Settings:
-    return Settings(steps=options.steps, resolution=options.resolution, seed=options.seed)
 
 
 def _measure(
@@ -215,7 +204,7 @@ def _pictures(prior: EmulatedPrior, options: StrengthOptions, sample: StereoSamp
 
 
 def strength_tables(records: Sequence[Record]) -> list[Table]:
-    """One table a group of pairs (all, rendered rectified, rendered posed, real), strengths by methods."""
+    """One table a group of pairs, strengths by methods."""
     groups = {
         "All pairs": list(records),
         "Rendered, rectified": [r for r in records if r["rendered"] and r["rectified"]],
@@ -245,7 +234,7 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
     prior, read, cells = EmulatedPrior(options.space, options.follow), lru_cache(maxsize=1)(load), []
     for ref, strength, method_name in product(refs, options.strengths, options.methods):
         method = find_method(method_name)
-        configuration = method.configuration(method.own_settings(_settings(options)))
+        configuration = method.configuration(method.own_settings(options.settings))
         emulated = f"emulated {options.space} {options.follow} {strength} {options.seed}"
         head = {"pair": ref.label, "strength": strength, "method": method_name}
         work = partial(_measure, prior, options, read, ref, strength, method_name)
@@ -253,15 +242,13 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
         cells.append(Item(key, work, name=", ".join(head.values()), head=head))
 
     def remarks(records: list[Record]) -> list[str]:
-        sentences = [
-            f"Emulated priors, affine in {options.space}, following their input by {options.follow:g}; "
-            f"processed at {options.resolution} px, {options.steps} steps, seed {options.seed}.",
-        ]
-        if options.figure is not None:
-            draw_strength(records, ORACLE, _pictures(prior, options, load(refs[0])), options.figure)
-            if options.results is not None:
-                picture = Path(os.path.relpath(options.figure, options.results.parent)).as_posix()
-                sentences.append(f"![What guidance gains by the prior's error; surfaces, lit]({picture})")
-        return sentences
+        said = f"Emulated priors, affine in {options.space}, following their input by {options.follow:g}; "
+        said += f"processed at {options.resolution} px, {options.steps} steps, seed {options.seed}."
+        if options.figure is None:
+            return [said]
+        draw_strength(records, ORACLE, _pictures(prior, options, load(refs[0])), options.figure)
+        page = options.results or options.out / "strength.md"
+        picture = Path(os.path.relpath(options.figure, page.parent)).as_posix()
+        return [said, f"![What guidance gains by the prior's error; surfaces, lit]({picture})"]
 
     return run_experiment(name, options, "Priors from exact to weak", cells, strength_tables, remarks)

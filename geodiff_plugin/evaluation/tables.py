@@ -11,9 +11,8 @@ import numpy as np
 
 from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.runner import Record
-from geodiff_plugin.runtime.confidence import RIGHT_WITHIN
 
-#: Below this number of images no interval is given: resampling four values says nothing.
+#: Below this number of images there is no interval: resampling four values says nothing.
 FEWEST_FOR_INTERVAL = 5
 #: Column headings of the depth metrics, by their names in a record.
 HEADINGS = {"abs_rel": "AbsRel", "delta1": "δ1", "delta2": "δ2", "delta3": "δ3"}
@@ -79,10 +78,7 @@ def mean_cell(values: Iterable[float | None], digits: int = 3) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """Cells as they are printed.
-
-    The first column names the row; ``groups`` are ``(heading, number of columns)`` over the whole header.
-    """
+    """Cells as they are printed; ``groups`` are ``(heading, number of columns)`` over the whole header."""
 
     title: str
     header: tuple[str, ...]
@@ -141,12 +137,7 @@ def value_at(record: Record, path: str) -> Any:
 
 def mean_of(path: str, digits: int = 3, factor: float = 1.0) -> CellOf:
     """A column: the mean of an entry of the records that have it."""
-
-    def mean(own: list[Record]) -> str:
-        values = (value_at(record, path) for record in own)
-        return mean_cell([factor * value for value in values if value is not None], digits)
-
-    return mean
+    return lambda own: mean_cell([factor * v for r in own if (v := value_at(r, path)) is not None], digits)
 
 
 def most_of(name: str, digits: int = 3) -> CellOf:
@@ -185,11 +176,9 @@ def headline(record: Record) -> float | None:
 def by_method(records: Sequence[Record], value_of: Callable[[Record], Any]) -> dict[str, dict[str, Any]]:
     """``method -> label -> value`` over the finished records that have one."""
     values: dict[str, dict[str, Any]] = {}
-    for record in records:
-        of_label = values.setdefault(record["method"], {})
-        value = value_of(record) if record["status"] == "ok" else None
-        if value is not None:
-            of_label[label_of(record)] = value
+    for method, own in grouped(records, "method").items():
+        known = {label_of(record): value_of(record) for record in own if record["status"] == "ok"}
+        values[method] = {label: value for label, value in known.items() if value is not None}
     return values
 
 
@@ -200,13 +189,10 @@ def metric_values(records: Sequence[Record], alignment: str, metric: str) -> Val
 
 def groups_of(records: Sequence[Record]) -> dict[str, set[str]]:
     """Labels of all samples, and of the rectified and the posed ones where both kinds are there."""
-    kinds = (True, False)
-    rectified, posed = ({label_of(r) for r in records if r.get("rectified") is kind} for kind in kinds)
-    groups = {count_of_pairs(len(rectified | posed)): rectified | posed}
-    if rectified and posed:
-        groups[count_of_pairs(len(rectified), "rectified ")] = rectified
-        groups[count_of_pairs(len(posed), "posed ")] = posed
-    return groups
+    kinds = (("rectified ", True), ("posed ", False))
+    labels = {name: {label_of(r) for r in records if r.get("rectified") is kind} for name, kind in kinds}
+    groups = {"": set().union(*labels.values())} | (labels if all(labels.values()) else {})
+    return {count_of_pairs(len(own), kind): own for kind, own in groups.items()}
 
 
 def whole_mean(values: Mapping[str, float], labels: Iterable[str], digits: int = 3) -> str:
@@ -267,25 +253,13 @@ def versus_table(records: Sequence[Record], reference: str) -> Table:
 
 
 _DISPARITY = {"epe": "EPE px", "bad1": "bad-1", "bad2": "bad-2", "bad3": "bad-3", "d1": "D1"}
-_BY_REGION = {
-    f"{region}.{name}": f"{region}, {heading}"
-    for region in ("visible", "edge", "flat")
-    for name, heading in _DISPARITY.items()
-    if name != "bad3"
-}
 #: Title -> where in a record its numbers are, their headings, note.
 _DETAILS: dict[str, tuple[str, dict[str, str], str]] = {
     "Disparity, rectified pairs": (
         "disparity.",
         _DISPARITY,
         "Metres turned into disparity at the left image's resolution; shares of pixels for bad-k and D1, "
-        "a dash where the truth's step is coarser than the threshold.",
-    ),
-    "Disparity by region, rectified pairs": (
-        "disparity.regions.",
-        _BY_REGION,
-        "Visible: neither hidden in the right view nor beside it; edge: within 4 px of a step of the true "
-        "disparity of more than 3 px; flat: the rest.",
+        "a dash where the truth's step is coarser than the threshold. By region in samples.jsonl.",
     ),
     "Boundaries, dense truth": (
         "boundaries.",
@@ -332,22 +306,6 @@ def details_tables(records: Sequence[Record]) -> list[Table]:
     return [regions_table(records), *(_details(records, title, *rest) for title, rest in _DETAILS.items())]
 
 
-def confidence_table(records: Sequence[Record]) -> Table:
-    """What the confidence of each method promises by decile, and what it keeps; pairs weigh the same."""
-    rows = []
-    for method, deciles_of in by_method(records, lambda record: record.get("confidence")).items():
-        for k, parts in enumerate(zip(*deciles_of.values(), strict=True)):
-            shares = np.array([part["share"] for part in parts])
-            if shares.any():
-                values = [[part[name] or 0.0 for part in parts] for name in ("promised", "kept", "abs_rel")]
-                means = (np.array(values) @ shares) / shares.sum()
-                name = f"{k / 10:.1f} to {(k + 1) / 10:.1f}"
-                rows.append((find_method(method).title, name, cell(shares.mean()), *map(cell, means)))
-    note = f"Confidence is the probability of a relative error below {RIGHT_WITHIN:g}; pixels of all pairs."
-    header = ("method", "confidence", "share of pixels", "promised", "kept", "AbsRel")
-    return Table("Confidence by decile", header, tuple(rows), note)
-
-
 def pairs_tables(records: Sequence[Record], reference: str = "guided") -> list[Table]:
     """The tables of ``geodiff eval pairs``."""
     note = (
@@ -360,5 +318,4 @@ def pairs_tables(records: Sequence[Record], reference: str = "guided") -> list[T
         *([versus_table(records, reference)] if any(r["method"] == reference for r in records) else []),
         *(summary_table(records, own, f"All metrics, {group}") for group, own in groups_of(records).items()),
         *details_tables(records),
-        confidence_table(records),
     ]

@@ -35,16 +35,10 @@ FAMILIES: dict[str, Callable[[str], Method]] = {
 
 
 def find_method(name: str) -> Method:
-    """The method of a name.
+    """The method of a name: a key of ``METHODS``, or ``family:parameter`` with a key of ``FAMILIES``.
 
-    Args:
-        name: a key of ``METHODS``, or ``family:parameter`` with a key of ``FAMILIES``; one that uses a prior
-            may be bound to another, to another seed, or to both: ``guided@prs-eth/marigold-depth-v1-1#3``.
-            Digits after the last # are always a seed.
-
-    Raises:
-        ValueError: neither; a prior or a seed for a method without a prior; one bound twice; or the family's
-            error about its parameter.
+    One that uses a prior may be bound to another, to another seed, or to both, as in ``guided@org/prior#3``.
+    ``ValueError`` for what there is not, and for what cannot be bound.
     """
     if name in METHODS:
         return METHODS[name]

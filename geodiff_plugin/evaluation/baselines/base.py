@@ -39,9 +39,8 @@ class NotApplicable(Exception):
 class Settings:
     """What the user chose for a run, the same for every method.
 
-    ``prior`` is ``"bundled"``, a hub id or a folder; ``steps`` and ``resolution`` (the longer side that it
-    works at, pixels) are the pipeline's own where they are ``None``; ``space`` is for a prior that does not
-    say what its output is affine in; ``views`` is how many views of a sample a method takes, at least 2.
+    ``steps`` and ``resolution`` (longer side, pixels) are the pipeline's own where they are ``None``;
+    ``space`` is for a prior that does not say; at most ``views`` views of a sample are taken.
     """
 
     prior: str = "bundled"
@@ -59,13 +58,9 @@ class Settings:
 class Prediction:
     """One method's answer for one sample, at the left image's resolution.
 
-    Attributes:
-        depth_m: ``(H, W)`` metres, not finite in holes; ``None`` where only relative depth is known.
-        relative: ``(H, W)`` float, affine in ``space``; ``None`` where only metres are known.
-        space: space for the oracle's alignment, see ``metrics.align``.
-        uncertainty: ``(H, W)`` float, larger is less certain; ``None`` where the method has none.
-        confidence: ``(H, W)`` float in [0, 1], see ``confidence.depth_confidence``; ``None`` as well.
-        notes: what the method reports beside the map, JSON values only.
+    All ``(H, W)``: ``depth_m`` metres, not finite in holes, or ``relative``, affine in ``space``, in which an
+    oracle aligns it; perhaps ``uncertainty``, larger is less certain, and ``confidence`` in [0, 1]. ``notes``
+    are JSON values.
     """
 
     depth_m: np.ndarray | None
@@ -125,17 +120,10 @@ class PriorCache:
 
 @dataclass(frozen=True)
 class Method:
-    """One entry of ``METHODS``.
+    """One entry of ``METHODS``: its key, the heading of its column, and what it does, one sentence.
 
-    Attributes:
-        name: key in ``METHODS``.
-        title: column heading.
-        summary: what it does, one sentence.
-        run: sample, settings, priors -> prediction; raises ``NotApplicable`` with a reason.
-        configuration: settings -> JSON values that change the method's result, beside the prior.
-        uses_prior: whether ``settings.prior`` matters.
-        prior: the prior that this method is bound to, whatever the settings say; ``None`` otherwise.
-        seed: the seed that it is bound to, likewise.
+    ``run`` raises ``NotApplicable`` with a reason; ``configuration`` are the JSON values that change its
+    result, beside the prior. ``prior`` and ``seed`` are what it is bound to, whatever the settings say.
     """
 
     name: str

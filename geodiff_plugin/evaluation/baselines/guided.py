@@ -48,7 +48,6 @@ def call_arguments(settings: Settings) -> dict[str, Any]:
 
 
 def _space(pipe: Any) -> str:
-    """Space in which the prior's output is affine, as its adapter says."""
     return find_adapter(pipe)(pipe).space
 
 
@@ -79,15 +78,11 @@ def guided_prediction(
 
 
 def _plain_configuration(settings: Settings) -> dict[str, Any]:
-    """Every setting but the prior."""
     return {key: value for key, value in asdict(settings).items() if key != "prior"}
 
 
 def guided_configuration(preset: Preset, settings: Settings) -> dict[str, Any]:
-    """Every hyperparameter of a preset and every setting but the prior, as JSON values.
-
-    A decoder in a folder counts by its files as well: one that was trained further keeps its name.
-    """
+    """Every hyperparameter of a preset, the files of its decoder, every setting but the prior, for JSON."""
     camera, pose = np.array([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]]), np.eye(4)
     pose[0, 3] = 0.1
     guidance = preset(np.zeros((32, 32, 3), np.uint8), camera, pose)
@@ -152,11 +147,7 @@ def guided_map(
 
 
 def _photometric_updates(right: Any, K: Any, E: Any) -> GeometryGuidance:
-    """Photometric error and pull only, started by the default's search, so that pixels are the change.
-
-    The paper names a rate of 1e-2 and no optimiser. A plain step of that size moves no pixel, because the
-    gradient of a mean over all pixels is tiny in each; Adam's do.
-    """
+    """Photometric error and pull only, started by the default's search, by Adam at the paper's rate."""
     updates: dict[str, Any] = {"inner_steps": 50, "step_latents": 0.01, "min_steps": 1}
     return GeometryGuidance(right, K, E, weights=PAPER.weights, correct=False, crisp=False, **updates)
 
@@ -171,11 +162,7 @@ def _run_reprojection(sample: StereoSample, settings: Settings, priors: PriorCac
 
 
 class RampPrior(DepthDiffusionPipeline):
-    """One step to the latent of a ground plane, near at the bottom and far at the top.
-
-    ``adapter`` is that of the prior that it stands in for, and ``module`` a network of that prior, which says
-    where the work is done.
-    """
+    """One step to the latent of a ground plane, near at the bottom, by the ``adapter`` of another prior."""
 
     max_steps, deterministic, sees_latents = 1, True, False
     adapter: Any
@@ -265,11 +252,7 @@ GUIDED_METHODS = (
 
 
 def variant(base: str, config: GuidanceConfig, text: str) -> Method:
-    """A preset with some knobs changed.
-
-    ``text`` is ``knob=value``, several joined by ``+``; ``weights.matches=0`` changes one weight, and
-    ``guided:pose=estimated`` withholds the poses. ``InputError`` names a knob or value that there is not.
-    """
+    """A preset with some knobs changed; ``knob=value``, several joined by ``+``; ``pose=estimated``."""
     name = f"{base}:{text}"
     if name == "guided:pose=estimated":
         summary = "the prior guided with the default preset, poses estimated from the photographs"

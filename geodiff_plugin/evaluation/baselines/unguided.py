@@ -33,10 +33,7 @@ from geodiff_plugin.types import CameraView
 
 
 def sweep(sample: StereoSample, device: str, views: int = 2) -> CostVolume:
-    """Planes from infinity to the default nearest one, swept through the left view of a sample of any pose.
-
-    At most ``views`` views are compared, the left one counted.
-    """
+    """Planes from infinity to the default nearest one, swept through the left of at most ``views`` views."""
 
     def moved(x: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(x, dtype=torch.float32, device=device)
@@ -59,10 +56,7 @@ WLS_LAMBDA, WLS_SIGMA = 8000.0, 1.5
 
 
 def sgbm_shift(sample: StereoSample, wls: bool = False) -> np.ndarray:
-    """``(H, W)`` float32 pixels: shift ``f b / z`` of a rectified pair, NaN where the match was rejected.
-
-    It is the disparity plus Middlebury's doffs; with ``wls`` smoothed and filled by weighted least squares.
-    """
+    """``(H, W)`` float32 pixels: ``f b / z``, disparity plus doffs; NaN where the match was rejected."""
     # Depth at infinity has the disparity cx_left - cx_right, which is 0 but for Middlebury's doffs.
     lowest = int(np.floor(sample.K_left[0, 2] - sample.K_right[0, 2]))
     count = 16 * int(np.ceil(MAX_SHIFT * sample.left.shape[1] / 16))
@@ -106,18 +100,15 @@ def _run_sweep(sample: StereoSample, settings: Settings, priors: PriorCache) -> 
     return Prediction(depth_m, space="disparity", notes={"density": float(matched.float().mean())})
 
 
-def _sgbm_choices(settings: Settings) -> dict[str, Any]:
-    return _SHIFTS | PARAMETERS
-
-
-_SHIFTS = {"max_shift": MAX_SHIFT, "min_shift_px": MIN_SHIFT_PX, "mode": "3way", "fill": "background"}
+_SHIFTS: dict[str, Any] = {"max_shift": MAX_SHIFT, "min_shift_px": MIN_SHIFT_PX, "mode": "3way"}
+_SHIFTS |= {"fill": "background"} | PARAMETERS
 _CHOICES = {"cost": "census", "aggregation": "semi-global", "fill": "background"}
 _SGBM = "OpenCV StereoSGBM (3-way) with background fill; rectified pairs only"
 _WLS = "the same smoothed by OpenCV's WLS filter; needs opencv-contrib-python"
 _SWEEP = "our own plane sweep, aggregated, left-right checked and filled, any pose"
 STEREO_METHODS = (
-    Method("sgbm", "SGBM + fill", _SGBM, partial(_run_sgbm, False), _sgbm_choices, uses_prior=False),
-    Method("sgbm-wls", "SGBM + WLS", _WLS, partial(_run_sgbm, True), _sgbm_choices, uses_prior=False),
+    Method("sgbm", "SGBM + fill", _SGBM, partial(_run_sgbm, False), lambda _: _SHIFTS, uses_prior=False),
+    Method("sgbm-wls", "SGBM + WLS", _WLS, partial(_run_sgbm, True), lambda _: _SHIFTS, uses_prior=False),
     Method(
         *("sweep-sgm", "sweep + SGM", _SWEEP, _run_sweep),
         lambda settings: _CHOICES | {"views": settings.views, "device": settings.device},
@@ -127,10 +118,7 @@ STEREO_METHODS = (
 
 
 def hf_method(name: str) -> Method:
-    """A depth checkpoint of transformers, hub id or folder; relative ones are scored aligned only.
-
-    It is loaded when it is first run, where errors are those of ``load_prior``.
-    """
+    """A depth checkpoint of transformers, hub id or folder; relative ones are scored aligned only."""
     if not name:
         bad_value("methods", "hf:MODEL with a hub id or a folder", "'hf:'")
 
@@ -195,15 +183,9 @@ def _prediction(values: np.ndarray, sample: StereoSample, kind: str) -> Predicti
 def files_method(text: str, guided: bool = False) -> Method:
     """Maps that were made elsewhere, in a folder: files:DIR or files:KIND:DIR.
 
-    Args:
-        text: ``DIR`` or ``KIND:DIR`` with a key of ``KINDS``. The map of a sample is
-            ``DIR/<dataset>_<sample>`` with the suffix .npy, .pfm or .png (16 bit: millimetres for depth,
-            pixels * 256 for disparity), of any size; 0 and what is not finite is unknown. The method does
-            not apply to samples without a file.
-        guided: the maps are the prior of the default preset.
-
-    Raises:
-        ValueError: no such folder. When run: a file that is damaged.
+    The map of a sample is ``DIR/<dataset>_<sample>`` with the suffix .npy, .pfm or .png (16 bit: millimetres
+    for depth, pixels * 256 for disparity), of any size; 0 and what is not finite is unknown. ``guided``: the
+    maps are the prior of the default preset.
     """
     kind, colon, named = text.partition(":")
     if not (colon and kind in KINDS):

@@ -26,16 +26,10 @@ def load(ref: SampleRef) -> StereoSample:
 
 
 def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **options: object) -> list[SampleRef]:
-    """References to every metric pair below ``root``, in the table's order; nothing is read yet.
+    """References to every metric pair of the ``datasets``, all by default, below ``root``, in their order.
 
-    Args:
-        root: folder that holds one or several data sets in their official layouts.
-        datasets: names to look for; all by default.
-        **options: for the data sets that know them: ``pairs`` and ``pixel_centre`` (mvsnet, robustmvd);
-            ``None`` for the set's own default.
-
-    Raises:
-        ValueError: ``root`` is not a folder, or a name is not in ``DATASETS``.
+    ``options`` are for the sets that know them (``pairs``, ``pixel_centre``); ``None`` is their default.
+    ``ValueError`` where ``root`` is no folder, or for a name that is not in ``DATASETS``.
     """
     root = Path(root)
     refs = []

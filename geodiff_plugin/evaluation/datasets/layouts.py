@@ -35,27 +35,22 @@ from geodiff_plugin.types import Rig
 
 
 def _read_pair(ref: SampleRef) -> tuple[Images, Rig]:
-    """Images and rig of the files ``left``, ``right``, ``calibration`` and, if any, ``calibration_right``.
-
-    Raises:
-        OSError: a file is missing.
-        ValueError: a file is damaged, or the calibration is for another size.
-    """
+    """Images and rig of the files ``left``, ``right``, ``calibration`` and, if any, ``calibration_right``."""
     files = ref.files
-    images = read_rgb(files["left"], "left image"), read_rgb(files["right"], "right image")
-    first, second = files["calibration"], files.get("calibration_right")
-    rig = read_calibration(
-        first if second is None else (first, second),
-        files.get("cameras"),
-        str(files["left"]),
-        image_names=(files["left"].name, files["right"].name),
-        image_size=images[0].shape[1::-1],
-    )
+    left, right, first, second = (files.get(k) for k in ("left", "right", "calibration", "calibration_right"))
+    images = read_rgb(left, "left image"), read_rgb(right, "right image")
+    given, names = first if second is None else (first, second), (left.name, right.name)
+    size = {"image_names": names, "image_size": images[0].shape[1::-1]}
+    rig = read_calibration(given, files.get("cameras"), str(left), **size)
     sizes = (first, rig.size_left, "left"), (second or first, rig.size_right, "right")
     for image, (path, size, side) in zip(images, sizes, strict=True):
         if size is not None:
             check_size(path, size[::-1], image.shape, side)
     return images, rig
+
+
+def _existing(path: Path) -> Path | None:
+    return path if path.is_file() else None
 
 
 def _like(image: np.ndarray, path: Path, values: np.ndarray) -> np.ndarray:
@@ -92,8 +87,8 @@ def _find_kitti(root: Path, name: str) -> list[SampleRef]:
             files = {
                 "left": left,
                 "right": folder / right_name / left.name,
-                "disparity": occ if occ.is_file() or not noc.is_file() else noc,
-                "noc": noc if occ.is_file() and noc.is_file() else None,
+                "disparity": _existing(occ) or _existing(noc) or occ,
+                "noc": _existing(noc) if occ.is_file() else None,
                 "calibration": folder / calibrations / f"{left.stem[:-3]}.txt",
                 "cameras": cameras,
             }
@@ -110,9 +105,8 @@ def _load_kitti(ref: SampleRef) -> StereoSample:
         _, seen_twice = read_depth_png(noc, 256.0, "disparity of the pixels seen twice")
         occluded = valid & ~_like(images[0], noc, seen_twice)
     depth_m = disparity_to_depth(_like(images[0], truth, disparity), rig.K_left, rig.K_right, rig.E)
-    depth_m = np.where(valid, depth_m, 0)
     notes = {"truth": truth.parent.name, "disparity_step_px": 1 / 256}
-    return make_sample(ref, images, rig, depth_m, notes, occluded=occluded)
+    return make_sample(ref, images, rig, np.where(valid, depth_m, 0), notes, occluded=occluded)
 
 
 #: Folders of scenes whose truth is not published; the archives of the images have them as well.
@@ -131,26 +125,17 @@ def _find_scenes(root: Path, name: str) -> list[SampleRef]:
         if not ((folder / "im0.png").is_file() and (folder / "calib.txt").is_file()):
             continue
         beside = folder.parent.parent / "two_view_training_gt" / folder.name / "disp0GT.pfm"
-        candidates = (folder / "disp0.pfm", folder / "disp0GT.pfm", beside)
-        truth = next((path for path in candidates if path.is_file()), None)
-        if truth is None and folder.parent.name in _TESTS:
-            continue
-        truth = truth or folder / "disp0.pfm"
+        truths = map(_existing, (folder / "disp0.pfm", folder / "disp0GT.pfm", beside))
+        truth = next(filter(None, truths), folder / "disp0.pfm")
         dataset = "middeval3" if truth.name == "disp0GT.pfm" else "middlebury2014"
         parts = (root.resolve().name, *folder.relative_to(root).parts)
         if any("eth3d" in part.lower() or "two_view" in part for part in parts):
             dataset = "eth3d"
-        if dataset != name:
-            continue
-        mask = truth.parent / "mask0nocc.png"
-        files = {
-            "left": folder / "im0.png",
-            "right": folder / "im1.png",
-            "calibration": folder / "calib.txt",
-            "disparity": truth,
-            "mask": mask if mask.is_file() else None,
-        }
-        refs.append(SampleRef(name, folder.name, files))
+        if dataset == name and (truth.is_file() or folder.parent.name not in _TESTS):
+            names = {"left": "im0.png", "right": "im1.png", "calibration": "calib.txt"}
+            files: dict[str, Any] = {key: folder / file for key, file in names.items()}
+            files |= {"disparity": truth, "mask": _existing(truth.parent / "mask0nocc.png")}
+            refs.append(SampleRef(name, folder.name, files))
     return refs
 
 
@@ -179,6 +164,8 @@ def _load_scene(ref: SampleRef) -> StereoSample:
 
 SHRINK = 4
 """Booster's images of 12 megapixels are scored at a quarter of their size, as the set's authors do."""
+#: Every fourth value: truth and classes must not be mixed across edges.
+_EVERY = np.s_[SHRINK // 2 :: SHRINK, SHRINK // 2 :: SHRINK]
 
 
 def _find_booster(root: Path) -> list[SampleRef]:
@@ -187,15 +174,11 @@ def _find_booster(root: Path) -> list[SampleRef]:
     for scene in folders(root, 3):
         if not ((scene / "camera_00").is_dir() and (scene / "camera_02").is_dir()):
             continue
+        names = {"disparity": "disp_00.npy", "occluded": "mask_00.png", "material": "mask_cat.png"}
+        names["calibration"] = "calib_00-02.xml"
         for left in sorted((scene / "camera_00").glob("im*.png")):
-            files = {
-                "left": left,
-                "right": scene / "camera_02" / left.name,
-                "disparity": scene / "disp_00.npy",
-                "occluded": scene / "mask_00.png",
-                "material": scene / "mask_cat.png",
-                "calibration": scene / "calib_00-02.xml",
-            }
+            files = {"left": left, "right": scene / "camera_02" / left.name}
+            files |= {key: scene / name for key, name in names.items()}
             refs.append(SampleRef("booster", f"{scene.name}-{left.stem}", files))
     return refs
 
@@ -206,11 +189,6 @@ def _quartered(image: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray
     shrunk = np.rint(F.avg_pool2d(planes, SHRINK)[0].permute(1, 2, 0).numpy()).astype(np.uint8)
     sizes = image.shape[:2], shrunk.shape[:2]
     return shrunk, resize_intrinsics(torch.from_numpy(K)[None], *sizes)[0].numpy()
-
-
-def _sampled(values: np.ndarray) -> np.ndarray:
-    """Every fourth value: truth and classes must not be mixed across edges."""
-    return values[SHRINK // 2 :: SHRINK, SHRINK // 2 :: SHRINK]
 
 
 def _load_booster(ref: SampleRef) -> StereoSample:
@@ -225,17 +203,17 @@ def _load_booster(ref: SampleRef) -> StereoSample:
         bad_value(str(files["left"]), f"of sides that are multiples of {SHRINK}", left.shape[:2])
     disparity = _like(left, files["disparity"], read_map(files["disparity"], "true disparity"))
     depth_m = disparity_to_depth(disparity, rig.K_left, rig.K_right, rig.E)
-    depth_m = _sampled(np.where(disparity > 0, depth_m, 0))
+    depth_m = np.where(disparity > 0, depth_m, 0)[_EVERY]
     masks = {
-        name: _sampled(_like(left, files[name], read_rgb(files[name], f"{name} mask")[..., 0]))
+        name: _like(left, files[name], read_rgb(files[name], f"{name} mask")[..., 0])[_EVERY]
         for name in ("occluded", "material")
         if files[name].is_file()
     }
     if "occluded" in masks:
         masks["occluded"] = (masks["occluded"] == 0) & (depth_m > 0)
     (left, K_left), (right, K_right) = _quartered(left, rig.K_left), _quartered(right, rig.K_right)
-    quarter, notes = replace(rig, K_left=K_left, K_right=K_right), {"truth": "disp_00.npy"}
-    return make_sample(ref, (left, right), quarter, depth_m, notes | {"disparity_step_px": 0.0}, **masks)
+    rig, notes = replace(rig, K_left=K_left, K_right=K_right), {"truth": "disp_00.npy"}
+    return make_sample(ref, (left, right), rig, depth_m, notes | {"disparity_step_px": 0.0}, **masks)
 
 
 #: Further views of the reference that a posed sample brings along, the best ones first.
@@ -310,10 +288,7 @@ def _load_posed(ref: SampleRef) -> StereoSample:
 
 
 def find_robustmvd(root: Path, pairs: str = "default", pixel_centre: float = 0.5) -> list[SampleRef]:
-    """Every key view with its best source view or, for ``pairs="all"``, with each of its sources.
-
-    The benchmark's cameras are COLMAP's, whose first pixel has its centre at 0.5.
-    """
+    """Every key view with its best source view or, for ``pairs="all"``, all its sources; COLMAP's cameras."""
     refs = []
     for scene, sources in _groups(root, pairs, benchmark=True):
         for view in KEY_VIEWS[scene.name]:
@@ -358,8 +333,7 @@ def _find_folders(root: Path) -> list[SampleRef]:
     """``root`` and the folders right below it with ``left.*``, ``right.*``, ``calib.*`` and perhaps depth.
 
     A folder that lacks one of the three counts as a pair: reading it names the file that is missing. The
-    calibration is one file of any known format, or ``calib_left.*`` and ``calib_right.*``; one with a pose
-    per image knows these as ``left.*`` and ``right.*``, in whatever folder.
+    calibration is one file of any known format, or ``calib_left.*`` and ``calib_right.*``.
     """
     refs = []
     for folder in folders(root, 1):
@@ -367,7 +341,7 @@ def _find_folders(root: Path) -> list[SampleRef]:
         single = sorted(folder.glob("calib.*"))
         pair = [*sorted(folder.glob("calib_left.*"))[:1], *sorted(folder.glob("calib_right.*"))[:1]]
         calibrated = bool(single) or len(pair) == 2
-        if (left is None and right is None) or (left is not None) + (right is not None) + calibrated < 2:
+        if not (left or right) or bool(left) + bool(right) + calibrated < 2:
             continue
         # What is missing has a path as well, so that reading the pair says so.
         files = {
@@ -375,7 +349,7 @@ def _find_folders(root: Path) -> list[SampleRef]:
             "right": right or folder / "right.png",
             "calibration": single[0] if single else pair[0] if calibrated else folder / "calib.txt",
             "calibration_right": pair[1] if calibrated and not single else None,
-            "depth": next((folder / name for name in _DEPTHS if (folder / name).is_file()), None),
+            "depth": next(filter(None, (_existing(folder / name) for name in _DEPTHS)), None),
         }
         refs.append(SampleRef("folder", folder.resolve().name, files))
     return refs

@@ -86,7 +86,7 @@ class StereoSample:
 class SampleRef:
     """A sample that was listed but not read yet; ``files`` has the paths and numbers that its loader needs.
 
-    A result is kept by what is in these files, so name files and not their folder.
+    A result is kept by what is in these files: name them, not their folder.
     """
 
     dataset: str
@@ -101,16 +101,10 @@ class SampleRef:
 
 @dataclass(frozen=True)
 class Dataset:
-    """How to list a data set, how to read it, how it is scored.
+    """How to list a data set below a folder, in a fixed order, how to read it, how it is scored.
 
-    Attributes:
-        name: key in ``DATASETS``.
-        find: folder -> references in a fixed order; an empty list where the folder holds none.
-        load: reference -> sample.
-        cap_m: farthest truth that counts in the set's own protocol, metres; ``None`` for no limit.
-        obtain: how to get the set, one sentence with its address and licence.
-        options: keywords that ``find`` takes beside the folder.
-        needs_folder: whether there is a folder to look into.
+    ``cap_m`` is the farthest truth that counts in its protocol, metres, if any; ``obtain`` says how to get
+    it, with its address and licence; ``options`` are keywords of ``find`` beside the folder, if any.
     """
 
     name: str
@@ -245,10 +239,9 @@ def with_exposure(sample: StereoSample, change: Sequence[float], name: str) -> S
 
 
 def with_drifted_rig(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
-    """What a rig gives whose right camera has turned since it was calibrated, and whose image has moved.
+    """What a rig gives whose right camera has turned and whose right image has moved since it was calibrated.
 
-    Both are a homography of the right image, whatever the depth: calibration and truth stay. ``change`` is
-    degrees, about an axis that is drawn from the name, and pixels up or down, likewise.
+    Both are a homography, whatever the depth. ``change`` is degrees and pixels; the name draws axis and sign.
     """
     degrees, px = change
     rng = np.random.default_rng(zlib.crc32(name.encode()))
@@ -265,11 +258,9 @@ def with_drifted_rig(sample: StereoSample, change: Sequence[float], name: str) -
 def perturbed_pose(
     E: np.ndarray, degrees: float, share: float, depth_m: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """A pose with an error, whose baseline is as long as before: the length is what no photograph tells.
+    """A pose with an error of at most ``degrees`` and that ``share`` of the baseline, which stays as long.
 
-    The turn is at most ``degrees``, the shift that ``share`` of the baseline. Every second error is of a
-    tracker's kind, whose shift makes up for its turn at the scene's depth as far as it may; the others' shift
-    goes anywhere.
+    Every second error is of a tracker's kind: its shift makes up for its turn at the scene's depth.
     """
     axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     turn = axis * np.radians(degrees) * rng.uniform(LEAST, 1.0)
