@@ -2,7 +2,7 @@
 
 These networks return a pose and intrinsics for every image, for the size at which they processed it and
 without a metric scale. This script writes a transforms.json beside the images, which `geodiff capture`
-reads; with --known-length or --distance its results are in metres. Files of predictions are .npz:
+reads; with --known-length its results are in metres. Files of predictions are .npz:
 
     da3           extrinsics (N, 3, 4) world-to-camera, intrinsics (N, 3, 3)
     vggt          extrinsic (N, 3, 4) world-to-camera, intrinsic (N, 3, 3), of pose_encoding_to_extri_intri

@@ -254,15 +254,15 @@ MUTANTS = [
         tests=(f"{UNIT}metric_priors.py",),
     ),
     *of(
-        "pose/scale.py",
-        ("DEPTH_SPREAD**2 + misfit**2", "DEPTH_SPREAD**2 + misfit"),
-        ("weight = of_length /", "weight = of_depth /"),
+        "pose/estimate.py",
         ("(np.array(ends).reshape(2, 2) + 0.5) * factor - 0.5", "np.array(ends).reshape(2, 2) * factor"),
-        ("LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.05", "LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.06"),
         ("ahead[close, 2] * inverse_depth", "np.linalg.norm(ahead[close], axis=1) * inverse_depth"),
     ),
     *of(
         "pose/refine.py",
+        ("DEPTH_SPREAD**2 + misfit**2", "DEPTH_SPREAD**2 + misfit"),
+        ("weight = of_length /", "weight = of_depth /"),
+        ("LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.05", "LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.06"),
         (
             "displacement.at((grid + 0.5) * scale - 0.5) / scale",
             "displacement.at((grid + 0.5) * scale - 0.5)",

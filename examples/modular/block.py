@@ -38,10 +38,10 @@ from transformers import CLIPTextModel, CLIPTokenizer
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.priors import find_adapter
+from geodiff_plugin.runtime.checks import left_images
 from geodiff_plugin.runtime.estimate import ProcessingGrid
 from geodiff_plugin.runtime.hooks import frozen_weights
 from geodiff_plugin.runtime.output import assemble_output
-from geodiff_plugin.runtime.pipeline import native_images
 from geodiff_plugin.runtime.run import GuidedRun
 
 UNET = ComponentSpec("unet", UNet2DConditionModel)
@@ -332,7 +332,7 @@ class GeometryEvidenceStep(Block):
         guidance = GeometryGuidance(block_state.right, block_state.K, block_state.E, **knobs)
         asked = block_state.num_inference_steps
         steps, rounds = count_steps(guidance.denoising_steps(asked, 1), asked, prior.max_steps)
-        evidence = guidance.prepare(native_images(block_state.image, host.vae.device))
+        evidence = guidance.prepare(left_images(block_state.image).to(host.vae.device))
         signature = inspect.signature(host.__call__)
         call = {name: value.default for name, value in signature.parameters.items()}
         call |= {"image": block_state.image, "num_inference_steps": steps}

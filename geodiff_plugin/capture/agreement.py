@@ -22,20 +22,15 @@ Maps = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class DepthFrame:
-    """Depth of one frame of a capture, as it goes from the runs to agreement and fusion.
-
-    ``depth`` is ``(H, W)`` z, ``confidence`` ``(H, W)`` in [0, 1], ``K (3, 3)`` pixels, ``E (4, 4)``
-    camera-to-world; ``confirmed`` and ``asked`` are ``(H, W)``: how many other frames have the same depth
-    there, and how many see the point by this depth, or a surface before it.
-    """
+    """Depth of one frame of a capture, as it goes from the runs to agreement and the cloud."""
 
     name: str
-    depth: np.ndarray
-    confidence: np.ndarray
-    K: np.ndarray
-    E: np.ndarray
-    confirmed: np.ndarray | None = None
-    asked: np.ndarray | None = None
+    depth: np.ndarray  # (H, W) z
+    confidence: np.ndarray  # (H, W) in [0, 1]
+    K: np.ndarray  # (3, 3) pixels
+    E: np.ndarray  # (4, 4) camera-to-world
+    confirmed: np.ndarray | None = None  # (H, W) how many other frames have the same depth there
+    asked: np.ndarray | None = None  # (H, W) how many see the point by this depth, or a surface before it
 
     def world(self, mask: np.ndarray | None = None) -> np.ndarray:
         """``(N, 3)`` points of the pixels of a mask, by default of all, in the world's frame."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -23,6 +23,8 @@ from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.pose.capture import SolvedCapture, solve_capture
 from geodiff_plugin.types import MetricDepthOutput
 
+#: Shares of red, green and blue in grey.
+GREY = np.array([0.299, 0.587, 0.114], np.float32)
 #: What 7-Scenes writes where depth is unknown.
 NO_DEPTH = 65535
 #: Angle of two rays that a match is worth most at, degrees, and how fast it is worth less below and above it.
@@ -42,15 +44,15 @@ class Capture:
     >>> out = capture.depth(pipe, "frame_0010")
 
     ``files`` is what was read, ``names`` those of the frames in order, ``unit`` ``"m"``, or ``None`` where no
-    length is known.
+    length is known, ``solved`` what ``solve`` found.
     """
 
     def __init__(self, files: CaptureFiles) -> None:
         self.files = files
         self.names = [frame.name for frame in files.frames]
         self.unit = files.unit
+        self.solved: SolvedCapture | None = None
         self._number = {name: number for number, name in enumerate(self.names)}
-        self._solved: SolvedCapture | None = None
         self._video: VideoReader | None = None
 
     @classmethod
@@ -118,22 +120,18 @@ class Capture:
             InputError: pycolmap is missing; frames without poses that cannot be connected.
         """
         check_choice(poses, "poses", ("refined", "given"))
-        if self._solved is None:
-            K = np.stack([frame.K for frame in self.files.frames])
-            self._solved = solve_capture(
-                self._greys(),
-                K,
+        if self.solved is None:
+            images, frames = map(self.image, self.names), self.files.frames
+            self.solved = solve_capture(
+                (np.rint(image @ GREY * 255).astype(np.uint8) for image in images),
+                np.stack([frame.K for frame in frames]),
                 self.poses,
-                [frame.size for frame in self.files.frames],
+                [frame.size for frame in frames],
                 threads=threads or available_cores(),
                 names=self.names,
                 poses=poses,
             )
-        return self._solved
-
-    def adopt(self, solved: SolvedCapture) -> None:
-        """Take poses that were solved before."""
-        self._solved = solved
+        return self.solved
 
     def rescale(self, factor: float) -> None:
         """Multiply all lengths, which then are metres, by a factor above 0."""
@@ -148,10 +146,10 @@ class Capture:
         )
         self.files = replace(self.files, frames=frames, unit="m")
         self.unit = "m"
-        if self._solved is not None:
-            s = self._solved
+        if self.solved is not None:
+            s = self.solved
             given = None if s.E_given is None else _longer(s.E_given, factor)
-            self._solved = replace(s, E=_longer(s.E, factor), E_given=given, points=s.points * factor)
+            self.solved = replace(s, E=_longer(s.E, factor), E_given=given, points=s.points * factor)
 
     def image(self, name: str) -> np.ndarray:
         """``(H, W, 3)`` float32 in [0, 1], upright, free of lens distortion."""
@@ -163,11 +161,6 @@ class Capture:
         else:
             image = read_image(frame.image, f"frame {name}")[0]
         return image if frame.lens is None else undistorted(image, frame.K, frame.lens)
-
-    def _greys(self) -> Iterator[np.ndarray]:
-        for name in self.names:
-            grey = self.image(name) @ np.array([0.299, 0.587, 0.114], np.float32)
-            yield np.rint(grey * 255).astype(np.uint8)
 
     def neighbours(self, name: str, count: int = NEIGHBOURS) -> list[str]:
         """Frames that are right views of a frame, at most ``count``, the best first."""
@@ -207,7 +200,7 @@ class Capture:
         if points == "none":
             return None
         if self.unit is None:
-            cure = "Give --metres-per-unit, --known-length or --distance."
+            cure = "Give --metres-per-unit or --known-length."
             bad_value("points", "of a capture whose scale is known", "one without a unit", cure)
         if points == "depth":
             depth_m, known = self.measured_depth(name)

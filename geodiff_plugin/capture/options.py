@@ -51,7 +51,6 @@ class CaptureOptions:
     known_length: str | None = declare(
         None, "A distance in the scene, NAME:X1,Y1,X2,Y2,METRES by pixels of a frame.", panel=CAMERAS
     )
-    distance: str | None = declare(None, "Distance of two cameras, NAME,NAME,METRES.", panel=CAMERAS)
     k: Path | None = declare(None, "3x3 intrinsics, text or .npy.", "--K", panel=CAMERAS)
     fov: float | None = declare(None, "Horizontal field of view, degrees.", panel=CAMERAS)
     trajectory: Path | None = declare(
@@ -74,9 +73,9 @@ class CaptureOptions:
     )
     export: tuple[str, ...] = declare(
         (),
-        "colmap: a dense workspace; mesh: by TSDF (extra mesh); repeatable.",
+        "colmap: images, poses and points as a model of COLMAP.",
         panel=OUTPUT,
-        choices=("colmap", "mesh"),
+        choices=("colmap",),
     )
     overwrite: bool = declare(
         False, "Write into a folder that holds files; do finished frames anew.", panel=OUTPUT
@@ -86,11 +85,8 @@ class CaptureOptions:
 
     def __post_init__(self) -> None:
         check_options(self)
-        ways = [self.metres_per_unit, self.known_length, self.distance]
-        if sum(way is not None for way in ways) > 1:
-            bad_value(
-                "the scale", "given in one way", "more of --metres-per-unit, --known-length, --distance"
-            )
+        if self.metres_per_unit is not None and self.known_length is not None:
+            bad_value("the scale", "given in one way", "both --metres-per-unit and --known-length")
 
     def key(self, names: Sequence[str], *of: str) -> str:
         """A digest of the settings ``of`` and the frames that a result depends on."""

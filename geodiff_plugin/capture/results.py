@@ -1,9 +1,9 @@
-"""What a run leaves behind its frames: depth agreed between them, one cloud, a contact sheet."""
+"""What a run leaves behind its frames: depth agreed between them, one cloud, a sheet, a model of COLMAP."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,12 @@ from PIL import Image
 
 from geodiff_plugin.capture.agreement import DepthFrame, agreed
 from geodiff_plugin.capture.capture import Capture, choose_neighbours
-from geodiff_plugin.capture.fusion import fuse, write_colmap_maps, write_mesh, write_normal_ply
-from geodiff_plugin.formats.clouds import write_glb
+from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb
 from geodiff_plugin.formats.depth import write_depth_mm, write_depth_npy
 from geodiff_plugin.formats.out import atomic_path
+from geodiff_plugin.formats.sfm import write_colmap
 from geodiff_plugin.plotting import depth_figure, depth_frames, grid
+from geodiff_plugin.pose.capture import Observations
 
 #: Depth and confidence of a frame by its own run, which agreement starts from whenever it is made anew.
 ALONE = ("depth_alone", "confidence_alone")
@@ -25,23 +26,22 @@ AGREED = ("depth", "confidence", "confirmed", "asked")
 OTHERS, ON_SHEET, GLB_POINTS = 6, 24, 400_000
 
 
-class _Frames(Sequence[DepthFrame]):
-    """Frames of a run, read whenever they are asked for: those of a long capture exceed the memory."""
+#: Points closer than this share of the median depth are one; points of lower confidence are left out.
+CELL_SHARE, LEAST_CONFIDENCE = 0.004, 0.5
+#: Points of one frame at most; more would not show in a cloud of many frames.
+MOST_POINTS = 200_000
+#: Frames after which their points are merged, so that a long capture fits the memory.
+MERGED_AFTER = 20
+VERTEX = np.dtype(
+    [(n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")] + [(n, "u1") for n in ("red", "green", "blue")]
+)
 
-    def __init__(self, capture: Capture, out: Path, names: Sequence[str], maps: Sequence[str]) -> None:
-        self._capture, self._out, self._names, self._maps = capture, out, list(names), maps
 
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def __getitem__(self, number: Any) -> Any:
-        return self.named(self._names[number])
-
-    def named(self, name: str) -> DepthFrame:
-        """The frame of a name."""
-        depth, confidence, *more = (np.load(self._out / name / f"{file}.npy") for file in self._maps)
-        solved, i = self._capture.solve(), self._capture.names.index(name)
-        return DepthFrame(name, depth, confidence, solved.K[i], solved.E[i], *more)
+def _frame(capture: Capture, out: Path, maps: Sequence[str], name: str) -> DepthFrame:
+    """A frame of a run, read when it is asked for: those of a long capture exceed the memory."""
+    depth, confidence, *more = (np.load(out / name / f"{file}.npy") for file in maps)
+    solved, i = capture.solve(), capture.names.index(name)
+    return DepthFrame(name, depth, confidence, solved.K[i], solved.E[i], *more)
 
 
 def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -52,7 +52,7 @@ def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[s
     """
     solved, number = capture.solve(), {name: i for i, name in enumerate(capture.names)}
     there, shares = {number[name] for name in names}, {}
-    load = lru_cache(maxsize=2 * OTHERS)(_Frames(capture, out, names, ALONE).named)
+    load = lru_cache(maxsize=2 * OTHERS)(partial(_frame, capture, out, ALONE))
     for name in names:
         others = [load(capture.names[i]) for i in choose_neighbours(solved, number[name], OTHERS, there)]
         frame, folder = agreed(load(name), others), out / name
@@ -76,17 +76,15 @@ def write_results(capture: Capture, out: Path, names: Sequence[str], export: Seq
 
     Frames are finished, and ``write_agreement`` has been there. Returns counts for the report.
     """
-    frames = _Frames(capture, out, names, AGREED)
-    cloud, normals = fuse(frames, capture.image)
+    load = partial(_frame, capture, out, AGREED)
+    cloud, normals = fuse(names, load, capture.image)
     write_normal_ply(out / "cloud.ply", cloud, normals, capture.unit)
-    cameras = [(f.K, f.E, f.depth.shape[::-1]) for f in frames]
+    cameras = [(f.K, f.E, f.depth.shape[::-1]) for f in map(load, names)]
     write_glb(out / "cloud.glb", cloud.thinned(GLB_POINTS), cameras)
-    if "mesh" in export:
-        write_mesh(out / "mesh.ply", frames, capture.image)
     if "colmap" in export:
         solved = capture.solve()
         seen = [solved.seen[capture.names.index(name)] for name in names]
-        write_colmap_maps(out / "colmap", frames, capture.image, solved.points, seen)
+        write_workspace(out / "colmap", map(load, names), capture.image, solved.points, seen)
     _sheet(capture, out, names)
     return {"cloud_points": len(cloud.points_m)}
 
@@ -103,3 +101,110 @@ def _sheet(capture: Capture, out: Path, names: Sequence[str]) -> None:
     titles = [title for name in shown for title in (name, "depth")]
     with atomic_path(out / "sheet.jpg") as temporary:
         grid(cells, titles, columns=min(4, len(cells)), cell_width=360).save(temporary, quality=88)
+
+
+def normals_of(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """``(H, W, 3)`` unit normals of a depth map in its camera's frame, towards the camera."""
+    height, width = depth.shape
+    v, u = np.mgrid[:height, :width]
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
+    points = rays * depth[..., None]
+    along = [np.gradient(points, axis=axis) for axis in (0, 1)]
+    normals = np.cross(along[0], along[1])
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    away = (normals * rays).sum(-1, keepdims=True) > 0
+    return np.where(away, -normals, normals).astype(np.float32)
+
+
+def kept(frame: DepthFrame) -> np.ndarray:
+    """``(H, W)`` pixels that become points: sure or confirmed, never contradicted, not flying."""
+    good = (frame.confidence >= LEAST_CONFIDENCE) & ~flying_points(frame.depth)
+    if frame.confirmed is not None and frame.asked is not None:
+        good &= (frame.confirmed > 0) | (frame.asked == 0)
+    return good
+
+
+def fuse(
+    names: Sequence[str], load: Callable[[str], DepthFrame], image: Callable[[str], np.ndarray]
+) -> tuple[Cloud, np.ndarray]:
+    """The cloud of all frames in the world's frame, one point a cell, and its ``(N, 3)`` normals.
+
+    ``load`` gives the agreed frame of a name, ``image`` its ``(H, W, 3)`` in [0, 1].
+    """
+    cell = CELL_SHARE * float(np.median([np.median(load(name).depth) for name in names]))
+    every_point = np.zeros((0, 9))
+    parts: list[np.ndarray] = []
+    for number, name in enumerate(names, 1):
+        parts.append(_points(load(name), image(name), cell))
+        if number % MERGED_AFTER == 0 or number == len(names):
+            every_point, parts = _thinned(np.concatenate([every_point, *parts]), cell), []
+    normals = every_point[:, 3:6]
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return Cloud(every_point[:, :3], np.rint(every_point[:, 6:]).astype(np.uint8)), normals
+
+
+def _points(frame: DepthFrame, image: np.ndarray, cell: float) -> np.ndarray:
+    """``(N, 9)`` places, normals and colours of one frame, in the world's frame."""
+    mask = kept(frame)
+    every = max(1, int(mask.sum()) // MOST_POINTS)
+    normals = normals_of(frame.depth, frame.K)[mask] @ frame.E[:3, :3].T
+    return _thinned(np.hstack([frame.world(mask), normals, image[mask] * 255])[::every], cell)
+
+
+def _thinned(rows: np.ndarray, cell: float) -> np.ndarray:
+    """The mean of the rows of every cell of a grid over their first three columns."""
+    if not len(rows):
+        return rows
+    cells = np.floor(rows[:, :3] / cell).astype(np.int64)
+    cells -= cells.min(0)
+    keys = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(0) + 1))
+    _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    sums = [np.bincount(inverse, rows[:, column], len(counts)) for column in range(rows.shape[1])]
+    return np.stack(sums, -1) / counts[:, None]
+
+
+def write_normal_ply(path: Path, cloud: Cloud, normals: np.ndarray, unit: str | None) -> None:
+    """Write a cloud with normals as binary PLY."""
+    columns = (*cloud.points_m.T, *normals.T, *cloud.colours.T)
+    vertices = np.rec.fromarrays(columns, dtype=VERTEX)
+    kinds = {"<f4": "float", "|u1": "uchar"}
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment world frame, {'metres' if unit else 'no unit'}",
+        f"element vertex {len(vertices)}",
+        *(f"property {kinds[VERTEX[name].str]} {name}" for name in VERTEX.names or ()),
+        "end_header\n",
+    ]
+    with atomic_path(path) as temporary:
+        temporary.write_bytes("\n".join(lines).encode() + vertices.tobytes())
+
+
+def write_workspace(
+    folder: Path,
+    frames: Iterable[DepthFrame],
+    image: Callable[[str], np.ndarray],
+    points: np.ndarray,
+    seen: Sequence[Observations],
+) -> None:
+    """Write images and a sparse model of COLMAP, for splatting and dense reconstruction.
+
+    ``points (M, 3)`` are those of the poses' solve, ``seen`` where each of the frames sees them.
+    """
+    for name in ("images", "sparse"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    views, colours = [], np.zeros(points.shape, np.uint8)
+    for frame, observed in zip(frames, seen, strict=True):
+        picture = np.rint(image(frame.name) * 255).astype(np.uint8)
+        size = picture.shape[1::-1]
+        Image.fromarray(picture).save(folder / "images" / f"{frame.name}.png")
+        u, v = np.rint(observed.px).astype(int).T.clip(0, np.array(size)[:, None] - 1)
+        colours[observed.point] = picture[v, u]
+        views.append((f"{frame.name}.png", frame.K, frame.E, size))
+    rows, counts = np.unique(np.concatenate([observed.point for observed in seen]), return_counts=True)
+    rows = rows[counts > 1]
+    place = np.full(len(points), -1)
+    place[rows] = np.arange(len(rows))
+    shared = [place[observed.point] >= 0 for observed in seen]
+    tracks = [(o.px[both], place[o.point[both]]) for o, both in zip(seen, shared, strict=True)]
+    write_colmap(folder / "sparse", views, Cloud(points[rows], colours[rows]), tracks)

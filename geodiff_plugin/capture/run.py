@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil  # comes with accelerate
 import torch
 
 from geodiff_plugin import __version__
@@ -38,7 +39,7 @@ Writer = Callable[[Path, MetricDepthOutput, np.ndarray], dict[str, Any]]
 POSES_FILE, SCALE_FILE, JOURNAL, REPORT = "poses.npz", "scale.json", "frames.jsonl", "report.json"
 #: What the poses depend on, and beside them the depth of a frame.
 OF_POSES = ("poses", "k", "fov", "trajectory")
-OF_SCALE = ("metres_per_unit", "known_length", "distance")
+OF_SCALE = ("metres_per_unit", "known_length")
 OF_FRAME = ("neighbours", "points", *OF_SCALE, "prior", "prior_map", "space", "steps", "seed")
 #: Memory that one process of the bundled prior takes at 640x480, bytes; what a larger prior takes is unknown.
 PROCESS_BYTES = 1.5e9
@@ -52,7 +53,8 @@ def open_capture(options: CaptureOptions) -> Capture:
     capture = Capture.open(options.path, K=K, fov=options.fov, trajectory=options.trajectory)
     if options.poses == "given" and capture.poses is None:
         bad_value("--poses given", "used with a capture that has poses", f"{options.path} without")
-    _length(capture, options)
+    if options.known_length is not None:
+        _length(capture, options.known_length)
     return capture
 
 
@@ -63,7 +65,7 @@ def solved_poses(capture: Capture, options: CaptureOptions) -> None:
     if solved is None:
         solved = capture.solve(options.poses, threads=available_cores())
         save_solved(path, solved, key)
-    capture.adopt(solved)
+    capture.solved = solved
     factor = _factor(capture, options, key)
     if factor is not None:
         capture.rescale(factor)
@@ -97,44 +99,29 @@ def load_solved(path: Path, key: str) -> SolvedCapture | None:
         return None
 
 
-def _length(capture: Capture, options: CaptureOptions) -> tuple[list[str], np.ndarray, float] | None:
-    """Frames of ``--distance``, or frame and two pixels of ``--known-length``, and the metres between."""
-    if options.distance is not None:
-        option, typed, form = "--distance", options.distance, "NAME,NAME,METRES"
-        *names, metres = (word.strip() for word in typed.split(","))
-        px: list[str] = []
-    elif options.known_length is not None:
-        option, typed, form = "--known-length", options.known_length, "NAME:X1,Y1,X2,Y2,METRES"
-        name, _, rest = typed.rpartition(":")
-        names, (*px, metres) = [name], rest.split(",")
-    else:
-        return None
-    if (len(names), len(px)) not in ((2, 0), (1, 4)):
-        bad_value(option, form, repr(typed))
+def _length(capture: Capture, typed: str) -> tuple[str, np.ndarray, float]:
+    """Frame of ``--known-length``, its two pixels ``(2, 2)``, and the metres between them."""
+    name, _, rest = typed.rpartition(":")
+    *px, metres = rest.split(",")
+    if len(px) != 4:
+        bad_value("--known-length", "NAME:X1,Y1,X2,Y2,METRES", repr(typed))
     try:
         *numbers, length = (float(word) for word in (*px, metres))
     except ValueError:
-        bad_value(option, "with numbers", repr(typed))
+        bad_value("--known-length", "with numbers", repr(typed))
     if not 0 < length < math.inf:
-        bad_value(option, "a length above 0", repr(typed))
-    ends, (width, height) = np.array(numbers).reshape(-1, 2), capture.frame(names[0]).size
+        bad_value("--known-length", "a length above 0", repr(typed))
+    ends, (width, height) = np.array(numbers).reshape(2, 2), capture.frame(name).size
     if not ((ends >= 0) & (ends <= (width - 1, height - 1))).all():
-        bad_value(option, f"pixels of {width}x{height}", repr(typed))
-    return [capture.frame(name).name for name in names], ends, length
+        bad_value("--known-length", f"pixels of {width}x{height}", repr(typed))
+    return capture.frame(name).name, ends, length
 
 
 def _factor(capture: Capture, options: CaptureOptions, key: str) -> float | None:
     """Metres per unit of the poses; that of ``--known-length`` by the depth of its frame, found once."""
-    given = _length(capture, options)
-    if given is None:
+    if options.known_length is None:
         return options.metres_per_unit
-    names, ends, metres = given
-    solved, numbers = capture.solve(), [capture.names.index(name) for name in names]
-    if options.distance is not None:
-        apart = float(np.linalg.norm(np.diff(solved.E[numbers, :3, 3], axis=0)))
-        if not apart > 0:
-            bad_value("--distance", "of two frames with different positions", repr(options.distance))
-        return metres / apart
+    name, ends, metres = _length(capture, options.known_length)
     path, asked = options.out / SCALE_FILE, f"{key} {options.known_length}"
     try:
         saved = json.loads(path.read_text(encoding="utf-8"))
@@ -142,8 +129,9 @@ def _factor(capture: Capture, options: CaptureOptions, key: str) -> float | None
             return float(saved["metres_per_unit"])
     except (OSError, ValueError, KeyError, TypeError):
         pass
-    depth = np.asarray(_depth(capture, _pipe(options), names[0], options).prediction)[0, ..., 0]
-    rays = np.linalg.solve(solved.K[numbers[0]], np.c_[ends, np.ones(2)].T).T
+    depth = np.asarray(_depth(capture, _pipe(options), name, options).prediction)[0, ..., 0]
+    K = capture.solve().K[capture.names.index(name)]
+    rays = np.linalg.solve(K, np.c_[ends, np.ones(2)].T).T
     points = rays * depth[tuple(np.rint(ends).astype(int).T[::-1])][:, None]
     factor = metres / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
     write_text(path, json.dumps({"metres_per_unit": factor, "of": asked}) + "\n")
@@ -243,7 +231,8 @@ def run_frames(
             journal.forget(item)
     left = sum(journal.get(item) is None for item in items)
     on_cpu = pick_device(options.device).type == "cpu"
-    wanted = options.processes or (min(available_cores(), _memory_processes()) if on_cpu else 1)
+    held = int(psutil.virtual_memory().available / PROCESS_BYTES)  # by the memory
+    wanted = options.processes or (min(available_cores(), max(1, held)) if on_cpu else 1)
     count = max(1, min(wanted, left)) if this_process().count == 1 else 1
     options = replace(options, processes=count)
     context = multiprocessing.get_context("spawn")
@@ -295,15 +284,6 @@ def _help(options: CaptureOptions, names: Sequence[str], write: Writer, index: i
     capture = open_capture(options)
     solved_poses(capture, options)
     _work(capture, options, write, _items(capture, options, names))
-
-
-def _memory_processes() -> int:
-    """How many processes the memory holds."""
-    try:
-        free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (ValueError, OSError, AttributeError):
-        return 2
-    return max(1, int(free / PROCESS_BYTES))
 
 
 def run_capture(options: CaptureOptions, write: Writer, say: Callable[[str], None]) -> dict[str, Any]:

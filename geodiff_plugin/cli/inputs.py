@@ -99,7 +99,6 @@ def read_inputs(
             K=Ks,
             baseline_m=options.baseline,
             known_length=_known_length(options.known_length, Ks[0], lenses[0]),
-            matcher=options.matcher or "sift",
             **known,
             config=config,
         )

@@ -40,8 +40,8 @@ from geodiff_plugin.formats.recordings import (
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.options import flag_of
 from geodiff_plugin.runner import BROKEN, Item, Journal, Runner
+from geodiff_plugin.runtime.checks import left_images
 from geodiff_plugin.runtime.machine import pick_device
-from geodiff_plugin.runtime.pipeline import native_images
 
 #: What became of every pair, as it is known to all processes of a run.
 JOURNAL = ".pairs.jsonl"
@@ -131,7 +131,7 @@ class Stages:
             torch.autocast(device.type, enabled=False),
         ):
             guidance.evidence_store = EvidenceStore(1, copies=False)
-            guidance.prepare(native_images(job.inputs.left, device))
+            guidance.prepare(left_images(job.inputs.left).to(device))
         return job
 
     def guide(self, job: Job) -> Job:
@@ -213,7 +213,7 @@ def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
         if has_pose_per_image(calib if len(calib) > 1 else calib[0]):
             cure = (
                 "Every pair of such a model has another distance. Give the model's scale: geodiff capture "
-                "MODEL with --distance, --known-length or --metres-per-unit."
+                "MODEL with --known-length or --metres-per-unit."
             )
             bad_value("--baseline", "left out with many pairs of one model", str(calib[0]), cure)
 

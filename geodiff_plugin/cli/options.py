@@ -77,7 +77,6 @@ class DepthOptions(RunOptions):
     estimate_pose: bool = _camera(False, "Find the poses from the photographs (needs the extra pose).")
     fov: float | None = _camera(None, "Horizontal field of view, degrees, if EXIF has no focal length.")
     known_length: str | None = _camera(None, "A distance in LEFT, X1,Y1,X2,Y2,METRES; instead of --baseline.")
-    matcher: str | None = _camera(None, "Finds points to match: sift, lightglue, superglue, a folder.")
     view: tuple[Path, ...] = _camera((), "A further view, with --view-E; repeat both for each.")
     view_k: tuple[Path, ...] = _camera((), "3x3 intrinsics of each --view; LEFT's if none.", "--view-K")
     view_e: tuple[Path, ...] = _camera((), "4x4 pose of each --view in the left camera's frame.", "--view-E")
@@ -188,7 +187,7 @@ class DepthOptions(RunOptions):
         yield paper, ("points", "disparity"), *default, "Algorithm 1 has no points."
         yield paper, ("view",), *default, "Algorithm 1 has two views."
         together = "given together with --estimate-pose", "no --estimate-pose"
-        yield not self.estimate_pose, ("fov", "known_length", "matcher"), *together, ""
+        yield not self.estimate_pose, ("fov", "known_length"), *together, ""
         names = ("calib", "cameras", "e", "view_e", "cx_right")
         cure = "Poses are given or estimated. For K alone give --K, or --fx --fy --cx --cy."
         yield self.estimate_pose, names, "left out with --estimate-pose", "both", cure

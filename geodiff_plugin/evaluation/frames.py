@@ -24,7 +24,7 @@ from geodiff_plugin.evaluation.tables import CellOf, Table, grouped, mean_of, mo
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runner import Item, Record, fingerprint
-from geodiff_plugin.runtime.pipeline import native_images
+from geodiff_plugin.runtime.checks import left_images
 
 #: What makes a sequence, by name; a checkout registers its renderer (tests/scenes/dataset.py).
 SEQUENCES: dict[str, Any] = {}
@@ -97,7 +97,7 @@ def _measure_sequence(
         guidance = GeometryGuidance(right.image_01, sequence.K.numpy(), sequence.E.numpy(), **knobs)
         guidance.evidence_store = store
         with torch.no_grad():
-            guidance.prepare(native_images(left.image_01, device))  # the same for every way, so not timed
+            guidance.prepare(left_images(left.image_01).to(device))  # the same for every way, so not timed
         generator = torch.Generator("cpu").manual_seed(options.seed)
         call = {"num_inference_steps": steps, "generator": generator, "output_latent": True}
         started = clock()

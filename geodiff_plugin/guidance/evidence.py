@@ -1,66 +1,35 @@
-"""From what the user gave to ``Evidence``: photographs cleaned, poses refined, volume and matches made, once.
-
-S3.3 takes exact poses for granted; ``pose.refine`` starts from a first depth, which a coarse sweep gives.
-"""
+"""Photographs cleaned, their poses refined or estimated, and ``Evidence`` made of them and remembered."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit
+from geodiff_plugin._checks import bad_type, bad_value, check_number
 from geodiff_plugin.algorithm.evidence import Evidence, prepare_evidence
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.guidance.inputs import Inputs
+from geodiff_plugin.formats import as_image_01
+from geodiff_plugin.formats.lenses import intrinsics_from_exif, intrinsics_from_fov
+from geodiff_plugin.geometry import image_size, resize_intrinsics, unproject
+from geodiff_plugin.guidance.inputs import Inputs, as_points
 from geodiff_plugin.matching import clean
-from geodiff_plugin.matching.build import pilot_volume
-from geodiff_plugin.matching.consistency import match_volume
+from geodiff_plugin.pose.estimate import Scale, estimate_poses, find_scale, polished
 from geodiff_plugin.pose.refine import refine_views, untouched
-from geodiff_plugin.types import CameraView, PoseReport
-
-# Windows that spread reliable matches into holes, pixels of the coarse sweep; a wider one counts a hundredth.
-_WINDOWS = (3, 7, 15, 31, 63)
-# Least inverse depth, as a share of the largest.
-_FARTHEST = 1e-3
+from geodiff_plugin.pose.solve import depth_spread, open_pose
+from geodiff_plugin.pose.tracks import coarse_depth, grey_views
+from geodiff_plugin.types import CameraView
 
 
 def cleaned(image_01: Tensor, config: GuidanceConfig) -> Tensor:
     """A photograph ``(3, H, W)`` in [0, 1] of native size, as the knob ``clean_photographs`` says."""
     return clean(image_01, config.sweep_pixels) if config.clean_photographs else image_01
-
-
-def pose_views(
-    left_01: Tensor,
-    rights: Sequence[CameraView],
-    K_left: Tensor,
-    config: GuidanceConfig = DEFAULT,
-    unit: str | None = "m",
-    measured: bool = False,
-) -> tuple[tuple[CameraView, ...], PoseReport]:
-    """The right views with the poses of the knob ``pose``, and the report; arguments as ``refine_views``."""
-    if config.pose == "given":
-        return untouched(rights)
-    first_depth = partial(coarse_depth, left_01, K_left=K_left)
-    return refine_views(left_01, rights, K_left, first_depth, unit, measured)
-
-
-def coarse_depth(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> Tensor:
-    """A rough, smooth depth without holes, ``(1, 1, h, w)`` metres: a coarse sweep, its matches spread."""
-    matches = match_volume(pilot_volume(left_01, rights, K_left))
-    weight = matches.confidence[None] ** 2 + 1e-9
-    values = matches.inverse_depth[None] * weight
-    above, below = values.clone(), weight.clone()
-    for i, window in enumerate(_WINDOWS):
-        share = 100.0 ** -(i + 1)
-        above += share * F.avg_pool2d(values, window, 1, window // 2, count_include_pad=False)
-        below += share * F.avg_pool2d(weight, window, 1, window // 2, count_include_pad=False)
-    inverse = F.avg_pool2d(above / below, 5, 1, 2, count_include_pad=False)
-    return 1.0 / inverse.clamp_min(_FARTHEST * float(inverse.max()))
 
 
 def make_evidence(
@@ -76,7 +45,10 @@ def make_evidence(
         return prepare_evidence(left_01, views, K_left, points, config, needs_matches)
     left_01 = cleaned(left_01, config)
     views = [view._replace(image_01=cleaned(view.image_01, config)) for view in views]
-    posed, report = pose_views(left_01, views, K_left, config, given.unit, measured)
+    if config.pose == "given":
+        posed, report = untouched(views)
+    else:
+        posed, report = refine_views(left_01, views, K_left, given.unit, measured)
     return prepare_evidence(left_01, posed, K_left, points, config, needs_matches, report)
 
 
@@ -131,3 +103,109 @@ def _equal(a: Tensor | None, b: Tensor | None) -> bool:
     if a is None or b is None:
         return a is b
     return a.device == b.device and a.shape == b.shape and torch.equal(a, b)
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedRig:
+    """Cameras of photographs that came without poses; numbers of several are of the right views."""
+
+    size_left: tuple[int, int]  # (width, height) of the left photograph
+    Ks: tuple[np.ndarray, ...]  # (3, 3) each, left one first
+    Es: tuple[np.ndarray, ...]  # (4, 4) each, pose in the left camera's frame, in metres or in units
+    inliers: tuple[int, ...]  # matches that the pose explains
+    parallax_deg: tuple[float, ...]  # median angle between the two rays of a point
+    residual_px: tuple[float, ...]  # median distance of the inliers from their epipolar lines
+    depth_spread: float | None  # relative, caused by errors of the poses; ``None`` for a rectified pair
+    scale: Scale  # where the unit comes from
+    notes: tuple[str, ...]  # sentences about what was assumed
+    warnings: tuple[str, ...]  # sentences for the user
+
+
+def _cameras(
+    photographs: Sequence[Any], images: Sequence[Tensor], K: Any, fov: float | None, cropped: bool
+) -> tuple[list[np.ndarray], list[str]]:
+    """K of every photograph, and what was assumed for it."""
+    given = list(K) if isinstance(K, (tuple, list)) and np.ndim(K[0]) == 2 else [K] * len(images)
+    if len(given) != len(images):
+        bad_value("K", f"one matrix, or {len(images)} of them", f"{len(given)}")
+    Ks: list[np.ndarray] = []
+    notes: list[str] = []
+    for i, (photograph, image, matrix) in enumerate(zip(photographs, images, given, strict=True)):
+        name = "the left photograph" if i == 0 else f"right photograph {i}"
+        size = (image.shape[-1], image.shape[-2])
+        if matrix is not None:
+            Ks.append(check_intrinsics(matrix, f"K of {name}"))
+            if not cropped:
+                check_intrinsics_fit(Ks[-1], *size, f"K of {name}", name)
+        elif fov is not None:
+            Ks.append(intrinsics_from_fov(fov, size))
+        elif hasattr(photograph, "getexif"):
+            from_exif, sentences = intrinsics_from_exif(photograph, name)
+            Ks.append(from_exif)
+            notes += sentences
+        else:
+            cure = "Give K, a field of view (fov), or PIL images that carry their EXIF."
+            bad_value(f"K of {name}", "known", "an array without EXIF", cure)
+    return Ks, notes
+
+
+def _listed(points: Tensor, K_left: Tensor, size: tuple[int, int]) -> np.ndarray:
+    """Points ``(N, 3)`` as they are, or those of a depth map of the left photograph, of any resolution."""
+    if points.shape[1] == 3:
+        return points.double().numpy()
+    K = resize_intrinsics(K_left[None], size, image_size(points))
+    xyz = unproject(points[None, None], K).reshape(-1, 3)
+    return xyz[xyz[:, 2] > 0].double().numpy()
+
+
+def estimate_rig(
+    photographs: Sequence[Any],
+    *,
+    K: Any = None,
+    fov: float | None = None,
+    baseline_m: float | None = None,
+    known_length: tuple[float, float, float, float, float] | None = None,
+    points: Any = None,
+    cropped: bool = False,
+) -> EstimatedRig:
+    """Cameras of two photographs or more, left one first; arguments as ``from_photographs``."""
+    if len(photographs) < 2:
+        bad_type("photographs", "two images or more", photographs)
+    names = ["left", *(f"right photograph {i}" for i in range(1, len(photographs)))]
+    images = [as_image_01(p, n) for p, n in zip(photographs, names, strict=True)]
+    Ks, notes = _cameras(photographs, images, K, fov, cropped)
+    if baseline_m is not None:
+        check_number(baseline_m, "baseline_m", 1e-6, 1e6)
+    K_left = torch.as_tensor(Ks[0], dtype=torch.float32, device="cpu")
+    size = image_size(images[0])
+    cloud = None if points is None else _listed(as_points(points, "points"), K_left, size)
+    images = [cleaned(image, DEFAULT) for image in images]
+
+    def posed(Ts: Iterable[np.ndarray]) -> list[CameraView]:
+        return [
+            CameraView(image, *(torch.as_tensor(m, dtype=torch.float32, device="cpu") for m in matrices))
+            for image, *matrices in zip(images[1:], Ks[1:], Ts, strict=True)
+        ]
+
+    views = grey_views(images[0], posed([np.eye(4)] * (len(images) - 1)), K_left)
+    tracks, poses = estimate_poses(views)
+    Ts, spread = np.stack([pose.T for pose in poses]), None
+    if not all(pose.rectified for pose in poses):
+        depth_m = coarse_depth(images[0], posed(Ts), K_left, views.left.shape)
+        Ts, tracks = polished(views, Ts, depth_m, tracks.seen_anywhere())
+        spread = depth_spread(tracks, Ts)
+    factor = tracks.K_left[0, 0] / Ks[0][0, 0]
+    scale = find_scale(tracks, Ts, factor, baseline_m, known_length, cloud)
+    Ts[:, :3, 3] *= scale.factor
+    return EstimatedRig(
+        size[::-1],
+        tuple(Ks),
+        tuple(np.linalg.inv(T) for T in Ts),
+        tuple(int(pose.inliers.sum()) for pose in poses),
+        tuple(pose.parallax_deg for pose in poses),
+        tuple(pose.residual_px for pose in poses),
+        spread,
+        scale,
+        tuple(notes),
+        (*(s for pose in poses for s in pose.warnings), *open_pose(spread), *scale.warnings),
+    )

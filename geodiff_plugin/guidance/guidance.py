@@ -18,9 +18,8 @@ from geodiff_plugin.algorithm.terms import TERMS
 from geodiff_plugin.config import PRESETS, GuidanceConfig, UpdatePlan
 from geodiff_plugin.formats import picture_size, read_calibration
 from geodiff_plugin.geometry import image_size
-from geodiff_plugin.guidance.evidence import EvidenceStore, make_evidence
+from geodiff_plugin.guidance.evidence import EstimatedRig, EvidenceStore, estimate_rig, make_evidence
 from geodiff_plugin.guidance.inputs import read_inputs, split_views
-from geodiff_plugin.guidance.photographs import EstimatedRig, estimate_rig
 from geodiff_plugin.types import MetricDepthOutput, Rig
 
 #: What is assumed of a rectified pair whose right camera has no K of its own.
@@ -116,7 +115,11 @@ class GeometryGuidance:
         if unit not in ("m", None):
             cure = "Give lengths in metres, or None for any other unit."
             bad_value("unit", "'m' or None", repr(unit), cure)
-        self.config, self.unit = config.changed(**knobs), unit
+        if previous is not None and not isinstance(previous, MetricDepthOutput):
+            bad_type("previous", "a MetricDepthOutput, of a guided call of the frame before", previous)
+        if previous is not None and (previous.latent is None or previous.scale is None):
+            bad_value("previous", "an output with its latent", "one without", "Call with output_latent=True.")
+        self.config, self.unit, self.previous = config.changed(**knobs), unit, previous
         check_choice(self.config.rule, "rule", RULES)
         for name in self.config.weights:
             check_choice(name, "a key of weights", TERMS)
@@ -127,7 +130,6 @@ class GeometryGuidance:
             assume_same_centre(self)
         self.measured_baseline = measured_baseline
         self.evidence_store: EvidenceStore | None = None
-        self.previous = previous
         self._cropped, self._left_size = cropped, check_size(left_size, "left_size")
         has_points = self.inputs[0].points is not None
         _check_sufficient(self.config, self.updates, views=bool(self.rights), points=has_points)
@@ -227,7 +229,6 @@ class GeometryGuidance:
         fov: float | None = None,
         known_length: tuple[float, float, float, float, float] | None = None,
         points: Any = None,
-        matcher: str = "sift",
         cropped: bool = False,
         **arguments: Any,
     ) -> Self:
@@ -244,7 +245,6 @@ class GeometryGuidance:
             known_length: ``(x1, y1, x2, y2, metres)``: two pixels of the left photograph, and the distance
                 between the two points in the scene; instead of ``baseline_m``.
             points: ``(N, 3)`` as in the constructor; they give the scale if nothing else does.
-            matcher: ``"sift"``, or ``"lightglue"``, ``"superglue"`` or a folder with weights of either.
             cropped: as in the constructor.
             **arguments: further arguments of the constructor.
 
@@ -260,7 +260,7 @@ class GeometryGuidance:
         Ks = K if K_right is None else [K, K_right]
         known = {"baseline_m": baseline_m, "known_length": known_length, "points": points}
         with noted() as warned:
-            rig = estimate_rig(photographs, K=Ks, fov=fov, matcher=matcher, cropped=cropped, **known)
+            rig = estimate_rig(photographs, K=Ks, fov=fov, cropped=cropped, **known)
             views = zip((None, *photographs[1:]), rig.Ks, (np.eye(4), *rig.Es), strict=True)
             guidance = cls.from_views(
                 list(views),
@@ -290,19 +290,6 @@ class GeometryGuidance:
     def search_only(cls, right: Any, K: Any, E: Any, **arguments: Any) -> Self:
         """Only the scale and shift that the search finds: no correction, no gradient updates."""
         return cls(right, K, E, preset="search-only", **arguments)
-
-    @property
-    def previous(self) -> MetricDepthOutput | None:
-        """Output of the previous frame, which the next call starts from; ``None`` for none."""
-        return self._previous
-
-    @previous.setter
-    def previous(self, output: MetricDepthOutput | None) -> None:
-        if output is not None and not isinstance(output, MetricDepthOutput):
-            bad_type("previous", "a MetricDepthOutput, of a guided call of the frame before", output)
-        if output is not None and (output.latent is None or output.scale is None):
-            bad_value("previous", "an output with its latent", "one without", "Call with output_latent=True.")
-        self._previous = output
 
     @property
     def updates(self) -> UpdatePlan:

@@ -53,39 +53,21 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class SolvedCapture:
-    """Poses of all frames after the solve.
+    """Poses of all frames after the solve."""
 
-    Attributes:
-        status: ``"given"`` (switched off), ``"kept"`` (no better poses), ``"solved"``, or ``"estimated"``
-            (from nothing).
-        E: ``(N, 4, 4)`` camera-to-world, lengths in the unit of the given poses; NaN where a frame without
-            given pose could not be connected.
-        E_given: the same as given, or ``None``.
-        K: ``(N, 3, 3)`` pixels.
-        connected: ``(N,)`` frames that the solve holds; the others keep their pose as given.
-        points: ``(M, 3)`` world.
-        seen: of every frame.
-        residual_px_given: median distance of matches from their epipolar lines under the given poses.
-        residual_px: the same under these.
-        scale_trajectory: factor from the adjusted lengths to those of the given positions.
-        scale_depth: the same to the depth of the scene under the given poses.
-        scale_spread: relative standard deviation of the scale in use.
-        notes: sentences for the user.
-    """
-
-    status: str
-    E: np.ndarray
-    E_given: np.ndarray | None
-    K: np.ndarray
-    connected: np.ndarray
-    points: np.ndarray
-    seen: tuple[Observations, ...]
-    residual_px_given: float = math.nan
-    residual_px: float = math.nan
-    scale_trajectory: float = 1.0
-    scale_depth: float = 1.0
-    scale_spread: float = math.nan
-    notes: tuple[str, ...] = ()
+    status: str  # "given" (switched off), "kept" (no better poses), "solved" or "estimated" (from nothing)
+    E: np.ndarray  # (N, 4, 4) camera-to-world in the given poses' unit, NaN for a frame without any pose
+    E_given: np.ndarray | None  # the same as given
+    K: np.ndarray  # (N, 3, 3) pixels
+    connected: np.ndarray  # (N,) frames that the solve holds; the others keep their pose as given
+    points: np.ndarray  # (M, 3) world
+    seen: tuple[Observations, ...]  # of every frame
+    residual_px_given: float = math.nan  # median distance of matches from epipolar lines, poses as given
+    residual_px: float = math.nan  # the same with these
+    scale_trajectory: float = 1.0  # factor from the adjusted lengths to those of the given positions
+    scale_depth: float = 1.0  # the same to the depth of the scene under the given poses
+    scale_spread: float = math.nan  # relative standard deviation of the scale in use
+    notes: tuple[str, ...] = ()  # sentences for the user
 
     def pose(self, of: int, beside: int) -> np.ndarray:
         """``(4, 4)`` pose of frame ``beside`` in the frame of ``of``: both solved, or both as given."""

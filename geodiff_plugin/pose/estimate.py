@@ -1,4 +1,4 @@
-"""Rotation and direction of the baseline of two photographs, by PoseLib (Larsson), or why there is none."""
+"""Poses of photographs by PoseLib (Larsson), their scale by a known length, or why there is none."""
 
 from __future__ import annotations
 
@@ -8,11 +8,22 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin.pose.matches import GreyViews, Matcher
-from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
+from geodiff_plugin._checks import bad_value, check_number
+from geodiff_plugin.pose.solve import FREE_PX, SCALE_PX, Prior, solve_poses
+from geodiff_plugin.pose.tracks import (
+    GreyViews,
+    Tracks,
+    dense_tracks,
+    merge_tracks,
+    project_tracks,
+    residuals_px,
+    solve_inverse_depth,
+    sparse_tracks,
+)
 
 #: An inlier lies nearer to its epipolar line, or to its place under a simpler motion, than this.
 INLIER_PX = 2.0
@@ -28,27 +39,26 @@ SIMPLER = 0.9
 #: of all matches, and of those, is one of the scene. Above the last, as a share of the first motion's
 #: matches, nobody can tell which of the two the camera made.
 APART_PX, SECOND_SHARE, SECOND_OF_REST, RIVAL = 6.0, 0.1, 0.5, 0.45
+# Robust scales of the last fits, pixels: nothing but the matches holds an estimated pose.
+_NARROWER_PX = (0.3, 0.15, 0.08)
+# A pixel's depth is that of the matches this near, pixels of their grid.
+_NEAR_PX = 40.0
+NO_UNIT = (
+    "No length is known, so the result has no unit: all depths are in baselines of the first two cameras. "
+    "Give their distance (baseline), a known length in the left photograph, or known points."
+)
 
 
 @dataclass(frozen=True, eq=False)
 class EstimatedPose:
-    """A relative pose of two photographs.
+    """A relative pose of two photographs."""
 
-    Attributes:
-        T: ``(4, 4)``, ``T_right_from_left`` with a baseline of length 1.
-        inliers: ``(N,)`` bool, the tracks that it explains.
-        parallax_deg: median angle between the two rays of an inlier.
-        residual_px: median distance of the inliers from their epipolar lines.
-        rectified: whether all rows agree, which those of two photographs by hand do not by chance.
-        warnings: sentences for the user.
-    """
-
-    T: np.ndarray
-    inliers: np.ndarray
-    parallax_deg: float
-    residual_px: float
-    rectified: bool
-    warnings: tuple[str, ...]
+    T: np.ndarray  # (4, 4) T_right_from_left with a baseline of length 1
+    inliers: np.ndarray  # (N,) bool, the tracks that it explains
+    parallax_deg: float  # median angle between the two rays of an inlier
+    residual_px: float  # median distance of the inliers from their epipolar lines
+    rectified: bool  # all rows agree, which those of two photographs by hand do not by chance
+    warnings: tuple[str, ...]  # sentences for the user
 
 
 def _right_rays(tracks: Tracks) -> np.ndarray:
@@ -106,7 +116,7 @@ def estimate_pose(tracks: Tracks, name: str = "the two photographs") -> Estimate
     return EstimatedPose(T, inliers, parallax, residual_px, sideways is not None, tuple(warnings))
 
 
-def estimate_poses(views: GreyViews, matcher: Matcher) -> tuple[Tracks, list[EstimatedPose]]:
+def estimate_poses(views: GreyViews) -> tuple[Tracks, list[EstimatedPose]]:
     """Poses of the right views of two photographs or more, matched anew.
 
     Returns:
@@ -115,7 +125,7 @@ def estimate_poses(views: GreyViews, matcher: Matcher) -> tuple[Tracks, list[Est
     Raises:
         InputError: as ``estimate_pose``; or views that share too few points with the first one.
     """
-    tracks, poses = matcher(views), []
+    tracks, poses = sparse_tracks(views), []
     for v in range(len(views.rights)):
         name = "the two photographs" if len(views.rights) == 1 else f"the left and right photograph {v + 1}"
         poses.append(estimate_pose(tracks.view(v), name))
@@ -222,3 +232,104 @@ def _rotation_residuals(tracks: Tracks) -> np.ndarray:
         off = np.linalg.norm(p[:, :2] / np.maximum(p[:, 2:], 1e-6) - tracks.right_px[0], axis=1)
         weights = 1.0 / (1.0 + (off / INLIER_PX) ** 2)
     return off
+
+
+def polished(views: GreyViews, Ts: np.ndarray, depth_m: Tensor, sparse: Tracks) -> tuple[np.ndarray, Tracks]:
+    """Estimated poses ``(V, 4, 4)`` of the ``sparse`` inliers, fitted once more to all matches of all views.
+
+    ``depth_m`` is as ``dense_tracks`` takes it. Returns the poses, the first baseline as long as it was, and
+    all matches.
+    """
+    Ts = Ts.astype(np.float32).astype(np.float64)  # those that the depth was made with
+    tracks = merge_tracks([sparse, dense_tracks(views, depth_m, Ts)])
+    free = Prior(np.full(len(Ts), FREE_PX), np.radians(3.0), 0.3, 0.02 if len(Ts) == 1 else 0.2)
+    solved = Ts
+    for scale_px in (SCALE_PX, *_NARROWER_PX):
+        solved = solve_poses(tracks, Ts, free, start=solved, scale_px=scale_px)
+    length = np.linalg.norm(Ts[0, :3, 3]) / np.linalg.norm(solved[0, :3, 3])
+    solved[:, :3, 3] *= length
+    return solved, tracks
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Metres per unit of an estimated pose."""
+
+    source: str  # "baseline", "known length", "points" or "none"
+    factor: float  # 1 without a source
+    spread: float | None = None  # relative standard error as the matches show, None where they cannot
+    warnings: tuple[str, ...] = ()  # sentences for the user
+
+    @property
+    def unit(self) -> str | None:
+        """``"m"``, or ``None`` where there is no unit."""
+        return None if self.source == "none" else "m"
+
+
+def _point_at(px: np.ndarray, tracks: Tracks, inverse_depth: np.ndarray) -> tuple[np.ndarray, float]:
+    """The point ``(3,)`` of a left pixel in units, and the relative spread of its depth."""
+    away = np.linalg.norm(tracks.left_px - px, axis=1)
+    near = np.argsort(away)[:8]
+    near = near[away[near] < _NEAR_PX]
+    if len(near) < 3:
+        cure = "Choose ends on something with texture that both photographs show."
+        got = f"({px[0]:.0f}, {px[1]:.0f}) with {len(near)} nearby"
+        bad_value("known length", "near matched points", got, cure)
+    w = inverse_depth[near]
+    middle = float(np.median(w))
+    spread = 1.4826 * float(np.median(np.abs(w / middle - 1)))
+    ray = np.linalg.solve(tracks.K_left, (*px, 1.0))
+    return ray / middle, spread
+
+
+def find_scale(
+    tracks: Tracks,
+    Ts: np.ndarray,
+    factor: float,
+    baseline_m: float | None,
+    known_length: tuple[float, float, float, float, float] | None,
+    points: np.ndarray | None,
+) -> Scale:
+    """Metres per unit, from whichever length is given.
+
+    ``Ts (V, 4, 4)`` are ``T_right_from_left`` in units; ``factor`` is pixels of the tracks' grid a pixel of
+    the left photograph; ``baseline_m`` the distance of the first right camera; ``known_length``
+    ``(x1, y1, x2, y2, metres)`` in the left photograph; ``points`` ``(N, 3)`` metres in the left frame.
+
+    Raises:
+        InputError: baseline and length together, or ends of a length where nothing is matched.
+    """
+    given = [name for name, v in (("baseline", baseline_m), ("known length", known_length)) if v is not None]
+    if len(given) > 1:
+        bad_value("scale", "given once", " and ".join(given), "Drop one; points may be given beside.")
+    if baseline_m is not None:
+        return Scale("baseline", baseline_m / float(np.linalg.norm(Ts[0, :3, 3])))
+    fits = (np.nan_to_num(residuals_px(tracks, Ts), nan=0.0) < 1.5).all(0)
+    tracks = tracks.kept(fits)
+    inverse_depth = solve_inverse_depth(tracks, Ts)
+    tracks, inverse_depth = tracks.kept(inverse_depth > 0), inverse_depth[inverse_depth > 0]
+    if known_length is not None:
+        *ends, metres = known_length
+        check_number(metres, "known length", 1e-6, 1e6)
+        pixels = (np.array(ends).reshape(2, 2) + 0.5) * factor - 0.5
+        (first, s1), (second, s2) = (_point_at(px, tracks, inverse_depth) for px in pixels)
+        length = float(np.linalg.norm(first - second))
+        if length < 1e-9:
+            bad_value("known length", "between two places", "the same place twice")
+        return Scale("known length", metres / length, float(np.hypot(s1, s2)))
+    if points is not None:
+        return _by_points(tracks, inverse_depth, points)
+    return Scale("none", 1.0, None, (NO_UNIT,))
+
+
+def _by_points(tracks: Tracks, inverse_depth: np.ndarray, points: np.ndarray) -> Scale:
+    ahead = points[points[:, 2] > 0]
+    px = project_tracks(ahead, np.zeros(len(ahead)), tracks.K_left, np.eye(4)).px
+    away, nearest = cKDTree(tracks.left_px).query(px)
+    close = away < _NEAR_PX / 4
+    if close.sum() < 5:
+        bad_value("points", "with at least 5 near matched points", f"{int(close.sum())}")
+    ratios = ahead[close, 2] * inverse_depth[nearest[close]]
+    factor = float(np.median(ratios))
+    spread = 1.4826 * float(np.median(np.abs(ratios / factor - 1))) / np.sqrt(close.sum())
+    return Scale("points", factor, spread)

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.pose.tracks import sift_features
 
-#: Longer side of the images that features are sought in, pixels, and how many are kept of an image.
-LONG_SIDE, MOST_FEATURES = 800, 2000
+#: Longer side of the images that features are sought in, pixels; most of an image; their least contrast.
+LONG_SIDE, MOST_FEATURES, CONTRAST = 800, 2000, 0.02
 #: Fewer inliers than this are no match of two frames.
 FEWEST_INLIERS = 20
 #: Standard deviation of given positions, as a share of the frames' spread; a tracker drifts by some per cent.
@@ -219,12 +220,6 @@ def _features(image: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]
     if factor < 1:
         size = round(image.shape[1] * factor), round(image.shape[0] * factor)
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    sift = cv2.SIFT.create(nfeatures=MOST_FEATURES, contrastThreshold=0.02)
-    points, descriptors = sift.detectAndCompute(image, None)
-    if not points or descriptors is None:
-        return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)
-    points, descriptors = points[:MOST_FEATURES], descriptors[:MOST_FEATURES]
-    px = np.array([(*p.pt, p.size / 2, math.radians(p.angle)) for p in points], np.float32)
-    px[:, :2] += 0.5
-    root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
+    points, root = (values[:MOST_FEATURES] for values in sift_features(image, MOST_FEATURES, CONTRAST))
+    px = np.c_[points[:, :2] + 0.5, points[:, 2] / 2, np.radians(points[:, 3])].astype(np.float32)
     return px, np.clip(np.rint(512 * root), 0, 255).astype(np.uint8)

@@ -14,26 +14,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geodiff_plugin.pose.matches import FirstDepth, dense_tracks, grey_views, sparse_tracks
 from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit, pose_change
-from geodiff_plugin.pose.scale import MOST_SCALE_SPREAD, refined_scale
-from geodiff_plugin.pose.solve import (
-    FREE_PX,
-    SCALE_PX,
-    Prior,
-    is_rig,
-    nearby_poses,
-    settle_poses,
-    solve_poses,
-)
+from geodiff_plugin.pose.solve import is_rig, nearby_poses, settle_poses
 from geodiff_plugin.pose.tracks import (
     FEWEST,
     Tracks,
     across_lines,
+    coarse_depth,
+    dense_tracks,
+    grey_views,
     median_residuals,
     merge_tracks,
     project_tracks,
     solve_inverse_depth,
+    sparse_tracks,
 )
 from geodiff_plugin.types import CameraView, PoseReport
 
@@ -44,9 +38,11 @@ FITS_PX, POSED_FITS_PX = 0.45, 0.3
 WARNS_PX = 1.0
 # A refinement must gain this share of the residual, and may turn and shift a camera so far.
 _LEAST_GAIN, _MOST_TURN_DEG, _MOST_SHIFT = 0.1, 8.0, 0.8
-# Robust scales of an estimated pose after the first, pixels. Nothing but the matches holds it, and what most
-# of them agree on is nearer the truth than what all of them are least far from.
-_NARROWER_PX = (0.3, 0.15, 0.08)
+#: Relative standard deviation, under the poses of a tracker, of the distance between two cameras and of the
+#: scene's median depth; measured on 85 pairs of two trackers (docs/how-to/poses.md).
+LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.05
+#: The user is warned if the scale of a refined pose is less certain than this.
+MOST_SCALE_SPREAD = 0.1
 # The user is warned if the pose that fits best changes log depth by more than this, in the median.
 _MOST_SPREAD = 0.13
 # Straightening: residual from which on a match counts for less, pixels; pull of the 20 coefficients towards
@@ -74,7 +70,6 @@ def refine_views(
     left_01: Tensor,
     rights: Sequence[CameraView],
     K_left: Tensor,
-    first_depth: FirstDepth,
     unit: str | None = "m",
     measured: bool = False,
 ) -> _Refined:
@@ -84,7 +79,6 @@ def refine_views(
         left_01: ``(3, H, W)`` float32 in [0, 1].
         rights: as they were given, one or several.
         K_left: ``(3, 3)`` pixels of ``left_01``.
-        first_depth: a rough depth by poses that fit roughly; asked only where refinement is due.
         unit: of the poses' lengths; those in metres are questioned where they seem to be in millimetres.
         measured: whether the lengths of the baselines are measured. Refined poses then keep them, as those of
             a rectified rig do; otherwise they are weighed against the scene's depth under the given poses.
@@ -110,7 +104,7 @@ def refine_views(
         return tuple(rights), replace(report, status="mistaken", warnings=mistakes)
     if not misfit:
         return tuple(rights), replace(report, warnings=units)
-    depth_m = _on_grid(first_depth(_applied(rights, near)), views.left.shape)
+    depth_m = coarse_depth(left_01, _applied(rights, near), K_left, views.left.shape)
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
     before = median_residuals(tracks, given)
     Ts, free = settle_poses(tracks, given, near, before, rig)
@@ -144,23 +138,24 @@ def refine_views(
     return _applied(rights, Ts, bends), report
 
 
-def polished(
-    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, first_depth: FirstDepth, sparse: Tracks
-) -> tuple[np.ndarray, Tracks]:
-    """Estimated poses fitted once more, to all matches of all views together.
+def refined_scale(refined: np.ndarray, given: np.ndarray, misfit: float) -> tuple[float, float]:
+    """By how much to multiply refined translations, and its relative standard deviation; NaN for none ahead.
 
-    ``rights`` have the poses of the ``sparse`` tracks, inliers of the estimation. Returns ``(V, 4, 4)``,
-    ``T_right_from_left``, the first baseline as long as it was; and all matches.
+    Two lengths survive a refinement: that of the baseline, and the depth of the scene, for a tracker errs in
+    turn and shift together. The result is their mean, weighted by their uncertainties. ``refined`` and
+    ``given (N,)`` are inverse depths under the refined poses, with baselines as long as given, and under the
+    given ones. ``misfit`` is the distance of the matches from their epipolar lines as a share of their
+    parallax, in the median: as much error is expected along the lines, where it changes depth.
     """
-    views, Ts = grey_views(left_01, rights, K_left), _poses(rights)
-    tracks = merge_tracks([sparse, dense_tracks(views, _on_grid(first_depth(rights), views.left.shape), Ts)])
-    free = Prior(np.full(len(Ts), FREE_PX), np.radians(3.0), 0.3, 0.02 if len(Ts) == 1 else 0.2)
-    solved = Ts
-    for scale_px in (SCALE_PX, *_NARROWER_PX):
-        solved = solve_poses(tracks, Ts, free, start=solved, scale_px=scale_px)
-    length = np.linalg.norm(Ts[0, :3, 3]) / np.linalg.norm(solved[0, :3, 3])
-    solved[:, :3, 3] *= length
-    return solved, tracks
+    ahead = (refined > 0) & (given > 0)
+    if not ahead.any():
+        return float("nan"), float("nan")
+    by_depth = float(np.median(np.log(refined[ahead] / given[ahead])))
+    of_length, of_depth = LENGTH_SPREAD**2, DEPTH_SPREAD**2 + misfit**2
+    weight = of_length / (of_length + of_depth)
+    # The variance of the weighted mean, and what the two lengths disagree by.
+    variance = weight * of_depth + weight * (1.0 - weight) * by_depth**2
+    return float(np.exp(weight * by_depth)), float(np.sqrt(variance))
 
 
 def _rescaled(
@@ -191,16 +186,12 @@ def _rescaled(
 
 @dataclass(frozen=True, eq=False)
 class Displacement:
-    """A cubic displacement of a right image of ``size`` ``(H, W)``.
+    """A cubic displacement of a right image."""
 
-    ``coefficients (10, 2)`` are pixels; no pixel moves further than ``most_px``; ``rms_px`` is that of the
-    matches.
-    """
-
-    coefficients: np.ndarray
-    size: tuple[int, int]
-    most_px: float
-    rms_px: float
+    coefficients: np.ndarray  # (10, 2) pixels
+    size: tuple[int, int]  # (H, W) of the image
+    most_px: float  # no pixel moves further
+    rms_px: float  # of the matches
 
     def at(self, px: np.ndarray) -> np.ndarray:
         """The displacement ``(N, 2)`` of pixels ``(N, 2)``."""
@@ -265,11 +256,6 @@ def straightened(image_01: Tensor, displacement: Displacement) -> Tensor:
     bent = cv2.remap(pixels, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     bent = bent.reshape(height, width, -1).clip(0.0, 1.0)
     return torch.from_numpy(np.ascontiguousarray(bent.transpose(2, 0, 1))).to(image_01)
-
-
-def _on_grid(depth_m: Tensor, size: tuple[int, int]) -> Tensor:
-    depth_m = depth_m.detach().cpu().float()
-    return torch.nn.functional.interpolate(depth_m, size, mode="bilinear", align_corners=False)
 
 
 def _poses(rights: Sequence[CameraView]) -> np.ndarray:

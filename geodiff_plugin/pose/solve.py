@@ -46,8 +46,8 @@ _RIG_MOVED_SHARE, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE = 0.4, np.radians(0.3), 0.
 # a tenth of a pixel; and residuals count half, because blocks of the image do not show all that neighbours
 # have in common.
 _SCALE_BY, _LEAST_SCALE_PX, _COUNTS = 2.0, 0.1, 0.5
-# Where the given pose was wrong, little but the matches holds the new one. What most
-# of them agree on is nearer the truth than what all of them are least far from: narrower fits follow.
+# Where the given pose was wrong, little but the matches holds the new one, and narrower fits follow: what
+# most of them agree on is nearer the truth than what all of them are least far from.
 _NARROWER_BY = (1.0, 0.5)
 
 _Terms = tuple[float, np.ndarray, np.ndarray]
@@ -58,16 +58,14 @@ _Terms = tuple[float, np.ndarray, np.ndarray]
 class Prior:
     """How far the poses as given are believed, as standard deviations.
 
-    ``moved_px (V,)`` is of where the tracks' points project to, ``turned_rad`` of the rotation,
-    ``shifted_share`` of the camera's centre and ``longer_share`` of the baseline's length, both as shares of
-    the baseline. What two views cannot determine, above all that length and a turn that a shift compensates,
+    What two views cannot determine, above all the baseline's length and a turn that a shift compensates,
     stays as given: such a move costs here and gains nothing in the residuals.
     """
 
-    moved_px: np.ndarray
-    turned_rad: float = np.radians(1.5)
-    shifted_share: float = 0.1
-    longer_share: float = 0.05
+    moved_px: np.ndarray  # (V,) of where the tracks' points project to
+    turned_rad: float = np.radians(1.5)  # of the rotation
+    shifted_share: float = 0.1  # of the camera's centre, as a share of the baseline
+    longer_share: float = 0.05  # of the baseline's length likewise
 
 
 def _turned(T: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -88,20 +86,14 @@ def _jacobian(at: Projected, inverse_depth: np.ndarray) -> np.ndarray:
 
 
 class _Whitened(NamedTuple):
-    """Residuals of tracks and their derivatives, each times the root of its robust weight; n = 2 V.
+    """Residuals of tracks and their derivatives, each times the root of its robust weight; n = 2 V."""
 
-    ``cost``, the sum of log(1 + (residual / scale)^2); ``inverse_depth (N,)`` 1/m that fits a track best;
-    ``residuals (N, n)``; ``left_by_pose (N, n, 6V)``, their derivative by ``_turned``'s step of every view
-    that no change of depth compensates; ``depth_by_pose (N, 6V)``, what a step does to the inverse depth,
-    times minus ``slopes (N,)``.
-    """
-
-    cost: float
-    inverse_depth: np.ndarray
-    residuals: np.ndarray
-    left_by_pose: np.ndarray
-    depth_by_pose: np.ndarray
-    slopes: np.ndarray
+    cost: float  # sum of log(1 + (residual / scale)^2)
+    inverse_depth: np.ndarray  # (N,) 1/m that fits a track best
+    residuals: np.ndarray  # (N, n)
+    left_by_pose: np.ndarray  # (N, n, 6V) by _turned's step of every view that no change of depth compensates
+    depth_by_pose: np.ndarray  # (N, 6V) what a step does to the inverse depth, times minus slopes
+    slopes: np.ndarray  # (N,)
 
 
 def _whitened(tracks: Tracks, Ts: np.ndarray, scale_px: float) -> _Whitened:

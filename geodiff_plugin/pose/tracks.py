@@ -1,4 +1,7 @@
-"""Points of the left image with their places in the right ones, and how well poses explain them (Eq. 25)."""
+"""Points of the left image with their places in the right ones, and how well poses explain them (Eq. 25).
+
+They are found by SIFT, and by optical flow after a first depth.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,29 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
+import cv2
 import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
 
+from geodiff_plugin.geometry import plane_rays, project_rays
+from geodiff_plugin.matching.build import pilot_volume
+from geodiff_plugin.matching.consistency import match_volume
+from geodiff_plugin.types import CameraView
+
+#: Longer side of the left image that matches are sought on, pixels; residuals are in pixels of this grid.
+LONG_SIDE = 832
+# SIFT. The nearest descriptor must be nearer than this share of the second nearest (Lowe 2004). The number of
+# points decides the time of matching. The contrast is low, so that blank walls give some points as well.
+_RATIO, _MOST_POINTS, _CONTRAST = 0.8, 4000, 0.01
+# Flow: one match a cell of so many pixels a side, whose grey has this standard deviation, of 255, or more.
+# Flow there and back may differ by so many pixels; flow further than that is no correction of a warp.
+_CELL_PX, _LEAST_CONTRAST, _THERE_AND_BACK_PX, _FARTHEST_PX = 10, 2.0, 0.5, 24.0
+# Windows that spread reliable matches into holes, pixels of the coarse sweep; a wider one counts a hundredth.
+_WINDOWS = (3, 7, 15, 31, 63)
+# Least inverse depth, as a share of the largest.
+_FARTHEST = 1e-3
 #: Fewer matches than this say nothing about a pose.
 FEWEST = 40
 #: Blocks a row of the left image, for what neighbouring residuals have in common.
@@ -18,17 +42,13 @@ _TINY = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Points seen in the left image and in V right images.
+    """Points seen in the left image and in V right images."""
 
-    ``left_px (N, 2)`` and ``right_px (V, N, 2)`` are float64 pixels; ``seen (V, N)`` says where ``right_px``
-    holds; ``K_left (3, 3)``, ``K_rights (V, 3, 3)``.
-    """
-
-    left_px: np.ndarray
-    right_px: np.ndarray
-    seen: np.ndarray
-    K_left: np.ndarray
-    K_rights: np.ndarray
+    left_px: np.ndarray  # (N, 2) float64
+    right_px: np.ndarray  # (V, N, 2) float64
+    seen: np.ndarray  # (V, N) where right_px holds
+    K_left: np.ndarray  # (3, 3)
+    K_rights: np.ndarray  # (V, 3, 3)
 
     def __len__(self) -> int:
         return len(self.left_px)
@@ -68,17 +88,12 @@ def merge_tracks(parts: Sequence[Tracks]) -> Tracks:
 
 
 class Projected(NamedTuple):
-    """Tracks in one right view, at given inverse depths.
+    """Tracks in one right view, at given inverse depths."""
 
-    ``px (N, 2)``; ``scaled (N, 3)``, the points in the right frame times their inverse left depth; the
-    derivatives of ``px`` by ``scaled``, ``by_point (N, 2, 3)``, and by inverse depth,
-    ``by_inverse_depth (N, 2)``.
-    """
-
-    px: np.ndarray
-    scaled: np.ndarray
-    by_point: np.ndarray
-    by_inverse_depth: np.ndarray
+    px: np.ndarray  # (N, 2)
+    scaled: np.ndarray  # (N, 3) the points in the right frame times their inverse left depth
+    by_point: np.ndarray  # (N, 2, 3) derivative of px by scaled
+    by_inverse_depth: np.ndarray  # (N, 2) by inverse depth
 
 
 def project_tracks(rays: np.ndarray, inverse_depth: np.ndarray, K: np.ndarray, T: np.ndarray) -> Projected:
@@ -163,15 +178,11 @@ def across_lines(tracks: Tracks, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def split_residuals(tracks: Tracks, T: np.ndarray) -> tuple[float, float]:
-    """Tell noise of single matches from what the residuals of neighbours have in common.
+    """How much a match counts, (0, 1], and the standard deviation of what neighbours share, pixels.
 
-    Residuals of neighbours are alike where no pose explains them (a rolling shutter, lens distortion, K), and
-    then a thousand matches hold a pose no better than a few. Blocks of the image show it: the mean of ``n``
-    independent residuals varies by ``1 / n`` of what a single residual does.
-
-    ``tracks`` are of one right view, which ``T (4, 4)`` fits. Returns how much of a match counts, in (0, 1];
-    and the standard deviation, pixels, of what neighbours have in common: that of the means of blocks beyond
-    what noise leaves in them, or of all residuals if the matches lie in too few blocks.
+    Residuals are alike where no pose explains them (a rolling shutter, lens distortion, K); then many matches
+    hold a pose no better than a few. It shows in blocks of the image, whose means of ``n`` independent
+    residuals vary by ``1 / n`` of what one does. ``T (4, 4)`` fits the tracks, of one right view.
     """
     off, _ = across_lines(tracks, T)
     scale = max(1.4826 * float(np.median(np.abs(off))), 1e-3)
@@ -188,3 +199,151 @@ def split_residuals(tracks: Tracks, T: np.ndarray) -> tuple[float, float]:
         between = (mean**2).mean()
         common = between - max(total - between, 0.0) * (1.0 / count).mean()
     return float(1.0 / max(inflated, 1.0)), float(max(common, 0.0) ** 0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class GreyViews:
+    """Grey images ``(H, W)`` uint8 on the grid of the matches, all at about as many pixels per radian."""
+
+    left: np.ndarray
+    rights: tuple[np.ndarray, ...]
+    K_left: np.ndarray  # (3, 3) float64
+    K_rights: np.ndarray  # (V, 3, 3)
+
+
+def _grey(image_01: Tensor, K_image: Tensor, factor: float) -> tuple[np.ndarray, np.ndarray]:
+    """A grey image shrunk by a factor <= 1, and its K."""
+    pixels = image_01.detach().cpu().float().permute(1, 2, 0).contiguous().numpy()
+    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if pixels.shape[-1] == 3 else pixels[..., 0]
+    K = K_image.detach().cpu().double().numpy().copy()
+    height, width = grey.shape
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    if factor < 1.0:
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        scale = np.array([size[0] / width, size[1] / height])
+        K[:2, :2] *= scale[:, None]
+        K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5
+    return np.rint(grey * 255.0).clip(0, 255).astype(np.uint8), K
+
+
+def grey_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> GreyViews:
+    """Images as matches are sought in them, of ``left_01 (3, H, W)`` in [0, 1] with its ``K_left (3, 3)``."""
+    left, K = _grey(left_01, K_left, min(1.0, LONG_SIDE / max(left_01.shape[-2:])))
+    small = []
+    for image, K_right, _ in rights:
+        as_fine = float(K[0, 0] / K_right[0, 0])
+        small.append(_grey(image, K_right, min(1.0, as_fine, 2 * LONG_SIDE / max(image.shape[-2:]))))
+    return GreyViews(left, tuple(grey for grey, _ in small), K, np.stack([K_right for _, K_right in small]))
+
+
+def sift_features(
+    grey: np.ndarray, most: int = _MOST_POINTS, contrast: float = _CONTRAST
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points ``(N, 4)`` float64 of a grey image ``(H, W)`` uint8, and their RootSIFT ``(N, 128)`` float32.
+
+    Of each point x and y, the centre of the first pixel at (0, 0), diameter and degrees; descriptors have
+    unit length (Arandjelovic and Zisserman 2012).
+    """
+    sift = cv2.SIFT.create(nfeatures=most, contrastThreshold=contrast)
+    points, descriptors = sift.detectAndCompute(grey, None)
+    if not points:
+        return np.zeros((0, 4)), np.zeros((0, 128), np.float32)
+    root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-7))
+    return np.array([(*p.pt, p.size, p.angle) for p in points], np.float64), root.astype(np.float32)
+
+
+def match_features(left: tuple[np.ndarray, np.ndarray], right: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Indices ``(M, 2)`` of features that are each other's nearest and pass the ratio test from the left."""
+    if min(len(left[0]), len(right[0])) < 2:
+        return np.zeros((0, 2), int)
+    alike = left[1] @ right[1].T  # unit vectors: distance^2 = 2 - 2 alike
+    rows = np.arange(len(alike))
+    best = alike.argmax(1)
+    nearest = alike[rows, best]
+    mutual = alike.argmax(0)[best] == rows
+    alike[rows, best] = -1.0
+    second = alike.max(1)
+    kept = mutual & ((1.0 - nearest) < _RATIO**2 * (1.0 - second))
+    return np.c_[rows[kept], best[kept]]
+
+
+def sparse_tracks(views: GreyViews) -> Tracks:
+    """SIFT points of the left image with their matches in the right ones."""
+    left = sift_features(views.left)
+    right_px = np.zeros((len(views.rights), len(left[0]), 2))
+    seen = np.zeros(right_px.shape[:2], bool)
+    for v, image in enumerate(views.rights):
+        right = sift_features(image)
+        of_left, of_right = match_features(left, right).T
+        right_px[v, of_left], seen[v, of_left] = right[0][of_right, :2], True
+    return Tracks(left[0][:, :2], right_px, seen, views.K_left, views.K_rights).seen_anywhere()
+
+
+def _flow(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Dense inverse search (Kroeger et al. 2016), ``(H, W, 2)`` pixels."""
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis.setFinestScale(0)
+    return dis.calc(source, target, None)
+
+
+def _read(field: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """Values of a map ``(H, W, 2)`` at pixels ``(N, 2)``, bilinear."""
+    at = px.astype(np.float32)[:, None]
+    return cv2.remap(field, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+
+
+def _dense_matches(
+    left: np.ndarray, right: np.ndarray, uv: np.ndarray, visible: np.ndarray, centres: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Right pixels ``(N, 2)`` of cell centres, which ``uv`` predicts, and which of them hold."""
+    warped = cv2.remap(right, uv, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    there, back = _flow(left, warped), _flow(warped, left)
+    flow = _read(there, centres)
+    landed = centres + flow
+    off = np.linalg.norm(flow + _read(back, landed), axis=1)
+    column, row = np.clip(np.rint(landed), 0, (left.shape[1] - 1, left.shape[0] - 1)).astype(int).T
+    values, window = left.astype(np.float32), (_CELL_PX + 1,) * 2
+    spread = cv2.blur(values**2, window) - cv2.blur(values, window) ** 2
+    holds = (off < _THERE_AND_BACK_PX) & (np.linalg.norm(flow, axis=1) < _FARTHEST_PX) & visible[row, column]
+    holds &= spread[centres[:, 1], centres[:, 0]] > _LEAST_CONTRAST**2
+    holds &= ((landed >= 0) & (landed <= np.array(left.shape[::-1]) - 1)).all(1)
+    return _read(uv, landed).astype(np.float64), holds
+
+
+def coarse_depth(
+    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, size: tuple[int, int]
+) -> Tensor:
+    """A rough, smooth depth without holes, ``(1, 1, H, W)`` metres: the matches of a coarse sweep, spread."""
+    matches = match_volume(pilot_volume(left_01, rights, K_left))
+    weight = matches.confidence[None] ** 2 + 1e-9
+    values = matches.inverse_depth[None] * weight
+    above, below = values.clone(), weight.clone()
+    for i, window in enumerate(_WINDOWS):
+        share = 100.0 ** -(i + 1)
+        above += share * F.avg_pool2d(values, window, 1, window // 2, count_include_pad=False)
+        below += share * F.avg_pool2d(weight, window, 1, window // 2, count_include_pad=False)
+    inverse = F.avg_pool2d(above / below, 5, 1, 2, count_include_pad=False)
+    depth_m = 1.0 / inverse.clamp_min(_FARTHEST * float(inverse.max()))
+    return F.interpolate(depth_m.detach().cpu().float(), size, mode="bilinear", align_corners=False)
+
+
+def dense_tracks(views: GreyViews, depth_m: Tensor, Ts: np.ndarray) -> Tracks:
+    """The centres of the left image's cells with their places by optical flow in the right images.
+
+    ``depth_m (1, 1, H, W)`` is rough, on the left grid, without holes, and goes with the poses ``Ts
+    (V, 4, 4)``, ``T_right_from_left``.
+    """
+    size = views.left.shape
+    rows, columns = (np.arange(_CELL_PX // 2, side, _CELL_PX) for side in size)
+    centres = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    right_px = np.zeros((len(Ts), len(centres), 2))
+    seen = np.zeros((len(Ts), len(centres)), bool)
+    for v, (image, K, T) in enumerate(zip(views.rights, views.K_rights, Ts, strict=True)):
+        K_left, K_right, T_right = (
+            torch.as_tensor(m, dtype=torch.float32, device="cpu")[None] for m in (views.K_left, K, T)
+        )
+        rays = plane_rays(K_left, K_right, T_right, (size[0], size[1]))
+        uv, z = (part[0].numpy() for part in project_rays(depth_m, rays))
+        visible = (uv >= 0).all(-1) & (uv <= np.array(image.shape[::-1]) - 1).all(-1) & (z > 0)
+        right_px[v], seen[v] = _dense_matches(views.left, image, uv, visible, centres)
+    return Tracks(centres.astype(np.float64), right_px, seen, views.K_left, views.K_rights).seen_anywhere()

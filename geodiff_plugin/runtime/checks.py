@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
+from torch import Tensor
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, refuse
 from geodiff_plugin.formats import as_image_01
@@ -22,9 +22,6 @@ STOCK_ARGUMENTS = (
     *("output_type", "resample_method_input", "resample_method_output", "batch_size", "num_inference_steps"),
     *("processing_resolution", "ensemble_size", "generator", "latents"),
 )
-#: Modes of PIL images that ``MarigoldImageProcessor`` reads; a palette's indices it takes for grey values.
-STOCK_MODES = ("L", "RGB", "I;16")
-STOCK_TYPES = (np.uint8, np.uint16, np.float16, np.float32, np.float64)
 #: More than any call asks for, of steps, pixels or members.
 MOST = 1 << 20
 
@@ -63,19 +60,15 @@ def check_arguments(call: Mapping[str, Any], images: int) -> None:
         expected = f"a torch.Generator, or a list of {members}: one for every image and member"
         bad_value("generator", expected, f"a list of {len(given)}")
     latents = call["latents"]
-    if isinstance(latents, torch.Tensor) and not latents.isfinite().all():
+    if isinstance(latents, Tensor) and not latents.isfinite().all():
         bad_value("latents", "finite", "NaN or infinity in it")
 
 
-def check_left_images(image: Any) -> tuple[Any, int]:
-    """Check left images as ``GeometryGuidance`` checks right ones, and count them.
+def left_images(image: Any) -> Tensor:
+    """Left images ``(N, 3, H, W)`` float32 in [0, 1], read as ``GeometryGuidance`` reads right ones.
 
     ``image`` is a PIL image, numpy ``(H, W, C)``, ``(H, W)`` or ``(N, H, W, C)``, torch ``(C, H, W)``, ``(H,
     W)`` or ``(N, C, H, W)``, or a list of them.
-
-    Returns:
-        The same object if the stock call reads it as it is meant, so that guidance changes nothing of what
-        the prior sees; else (alpha, a palette, CMYK, a little overshoot) tensors ``(3, H, W)`` in [0, 1].
     """
     named = list(_named(image, "image"))
     if not named:
@@ -87,42 +80,20 @@ def check_left_images(image: Any) -> tuple[Any, int]:
             expected = f"of {size[2]}x{size[1]} pixels, as {named[0][0]}"
             got = f"{tensor.shape[2]}x{tensor.shape[1]}"
             bad_value(name, expected, got, "Call once for every size.")
-    # The stock check of sizes compares the last two axes, which of arrays may be columns and channels.
-    ranks = {entry.ndim if isinstance(entry, np.ndarray) else 0 for _, entry in named}
-    if len(ranks) == 1 and all(_stock_reads(entry) for _, entry in named):
-        return image, len(named)
-    return tensors if isinstance(image, list) or len(named) > 1 else tensors[0], len(named)
+    return torch.stack(tensors)
 
 
 def _named(image: Any, name: str) -> Iterator[tuple[str, Any]]:
     """Every single image with its name in messages; of a batch with its index."""
     several = isinstance(image, list)
-    if isinstance(image, (np.ndarray, torch.Tensor)):
+    if isinstance(image, (np.ndarray, Tensor)):
         several = image.ndim == 4
-        image = image[None] if isinstance(image, torch.Tensor) and image.ndim == 2 else image
+        image = image[None] if isinstance(image, Tensor) and image.ndim == 2 else image
     if not several:
         yield name, image
         return
     for i, entry in enumerate(image):
         yield from _named(entry, f"{name}[{i}]")
-
-
-def _stock_reads(image: Image.Image | np.ndarray | torch.Tensor) -> bool:
-    """Whether the stock call reads a good image as ``as_image_01`` does."""
-    if isinstance(image, Image.Image):
-        return image.mode in STOCK_MODES
-    if isinstance(image, torch.Tensor):
-        if image.shape[0] == 4:
-            return False
-        return image.dtype == torch.uint8 or (image.is_floating_point() and _in_unit_range(image))
-    if image.dtype not in STOCK_TYPES or (image.ndim == 3 and image.shape[-1] == 4):
-        return False
-    # torch takes no array that was flipped; integers are copied before.
-    return image.dtype.kind == "u" or (min(image.strides) >= 0 and _in_unit_range(image))
-
-
-def _in_unit_range(image: np.ndarray | torch.Tensor) -> bool:
-    return bool(image.min() >= 0.0 and image.max() <= 1.0)
 
 
 def needs_network(guidance: GeometryGuidance) -> bool:

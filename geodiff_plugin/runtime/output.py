@@ -24,8 +24,8 @@ from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth
 from geodiff_plugin.geometry import image_size, resize_intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.matching import Matches, build_cost_volume, match_volume
+from geodiff_plugin.pose.estimate import NO_UNIT
 from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.pose.scale import NO_UNIT
 from geodiff_plugin.runtime.confidence import depth_confidence, reprojection
 from geodiff_plugin.runtime.run import GuidedRun
 from geodiff_plugin.runtime.verdict import Indicators, Verdict, judge, points_agreement, read_indicators
@@ -154,17 +154,15 @@ def assemble_output(
     prior_error = run.prior_error()  # (N, 1, 1, 1), or of every pixel with the measured one as the least
     confidence, over_prior = None, _over_prior(run, depth_m)
     if support is not None:
-        confidence = _confidence(support, depth_m, visible, error, uncertainty, prior_error)
+        unseen = torch.zeros_like(depth_m)
+        seen = (unseen, unseen > 0) if visible is None else (error, visible)
+        spread = None if uncertainty is None else uncertainty / depth_m
+        confidence = depth_confidence(support, *seen, spread, prior_error)
     relative = torch.cat(run.relative)
     relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
-    told: dict[str, Any] = {
-        "doubts": tuple(sentence for sentence, forbids in warned.items() if forbids),
-        "has_unit": has_unit,
-    }
-    verdicts = []
-    for i, K_left in enumerate(Ks):
-        told |= _means(i, confidence, over_prior if has_unit else None, count)
-        verdicts.append(judge(_indicators(run, i, K_left, depth_m[i], relative[i : i + 1], **told)))
+    told = {"doubts": tuple(s for s, forbids in warned.items() if forbids), "has_unit": has_unit}
+    maps = relative, confidence, over_prior if has_unit else None
+    verdicts = [judge(_indicators(run, i, K, depth_m[i], *maps, **told)) for i, K in enumerate(Ks)]
     if confidence is not None:
         agreement = confidence.new_tensor([points_agreement(verdict.indicators) for verdict in verdicts])
         confidence = confidence * agreement.view(-1, 1, 1, 1)
@@ -212,21 +210,6 @@ def assemble_output(
     return output
 
 
-def _confidence(
-    support: Tensor,
-    depth_m: Tensor,
-    visible: Tensor | None,
-    error: Tensor | None,
-    uncertainty: Tensor | None,
-    prior_error: Tensor | None,
-) -> Tensor:
-    """``depth_confidence`` with zeros for what no view shows."""
-    error = torch.zeros_like(depth_m) if error is None else error
-    visible = torch.zeros_like(depth_m, dtype=torch.bool) if visible is None else visible
-    spread = None if uncertainty is None else uncertainty / depth_m
-    return depth_confidence(support, error, visible, spread, prior_error)
-
-
 def _reprojected(
     run: GuidedRun, depth_m: Tensor, lefts: Tensor, K: Tensor
 ) -> tuple[Tensor, Tensor] | tuple[None, None]:
@@ -240,14 +223,6 @@ def _reprojected(
         return None, None
     visible, error = zip(*maps, strict=True)
     return torch.cat(visible), torch.cat(error)
-
-
-def _means(image: int, confidence: Tensor | None, over_prior: Tensor | None, count: int) -> dict[str, float]:
-    """Mean confidence of an image, and its median factor over a metric prior, where there are any."""
-    means = {} if confidence is None else {"confidence": float(confidence[image].mean())}
-    if over_prior is not None:
-        means["own_ratio"] = float(over_prior.reshape(count, -1)[image].median())
-    return means
 
 
 def _over_prior(run: GuidedRun, depth_m: Tensor) -> Tensor | None:
@@ -291,9 +266,20 @@ def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> Metr
 
 
 def _indicators(
-    run: GuidedRun, image: int, K_left: Tensor, depth_m: Tensor, relative: Tensor, **more: Any
+    run: GuidedRun,
+    image: int,
+    K_left: Tensor,
+    depth_m: Tensor,
+    relative: Tensor,
+    confidence: Tensor | None,
+    over_prior: Tensor | None,
+    **more: Any,
 ) -> Indicators:
     """Indicators of one image; matches to judge it by are made here, where its run used none."""
+    if confidence is not None:
+        more["confidence"] = float(confidence[image].mean())
+    if over_prior is not None:
+        more["own_ratio"] = float(over_prior.reshape(len(run.evidence), -1)[image].median())
     samples, evidence, config = run.samples_of(image), run.evidence[image], run.config
     order = float(torch.stack([t.order[i] for t, i in samples if t.order is not None]).nanmean())
     if evidence.matches is None and evidence.native_views:
@@ -304,7 +290,7 @@ def _indicators(
             )
             matches = match_volume(volume)
             evidence = replace(evidence, matches=matches, points=None)
-            order = float(order_agreement(relative, matches, run.prior.space))
+            order = float(order_agreement(relative[image : image + 1], matches, run.prior.space))
     return read_indicators(
         evidence,
         K_left,

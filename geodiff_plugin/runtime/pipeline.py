@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from diffusers import DiffusionPipeline, MarigoldDepthPipeline
-from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -26,8 +25,8 @@ from geodiff_plugin.priors.tiny import tiny_autoencoder
 from geodiff_plugin.runtime.checks import (
     check_arguments,
     check_guidable,
-    check_left_images,
     check_named_arguments,
+    left_images,
 )
 from geodiff_plugin.runtime.estimate import ProcessingGrid
 from geodiff_plugin.runtime.hooks import Exclusive
@@ -105,21 +104,21 @@ class GuidedCall(_Stock):
         self, call: dict[str, Any], guidance: GeometryGuidance, callback: StepCallback | None, held: Exclusive
     ) -> tuple[GuidedRun, Any]:
         """The stock call with everything in place; ``call`` becomes what it was given in the end."""
-        image, count = check_left_images(call["image"])
+        lefts_01 = left_images(call["image"])  # (N, 3, H, W)
         prior = find_adapter(self)(self)
-        check_arguments(call, count)
+        check_arguments(call, len(lefts_01))
         asked = call["num_inference_steps"]
         wanted = guidance.denoising_steps(asked, self.default_denoising_steps)
         steps, rounds = count_steps(wanted, asked, prior.max_steps)
         resampling = call["resample_method_output"] or "bilinear"
-        call |= {"image": image, "num_inference_steps": steps, "resample_method_output": resampling}
+        call |= {"num_inference_steps": steps, "resample_method_output": resampling}
         check_guidable(self, prior, guidance)
         tiny = tiny_autoencoder(self, guidance.config.decoder)
         if prior.deterministic and call["ensemble_size"] > 1:
             call |= _one_member(call)
         device = self._execution_device
-        lefts_01 = native_images(image, device)  # (N, 3, H, W)
-        grid = self._processing_grid(image, call, device)
+        lefts_01 = lefts_01.to(device)
+        grid = self._processing_grid(lefts_01, call, device)
         with torch.autocast(device.type, enabled=False):
             evidence = guidance.prepare(lefts_01)
             if prior.takes_prompt and call.get("prompt_depth") is None:
@@ -127,8 +126,9 @@ class GuidedCall(_Stock):
         warm = plan_warm_start(self, prior, guidance, call, grid.size)
         if warm is not None and warm.latents is not None:
             call |= {"latents": warm.latents, "generator": None}  # the latents hold the noise already
-        if call["latents"] is not None:
-            call["image"] = lefts_01  # beside latents Marigold takes no channels-last image
+        # Channels last, as the stock call reads pictures; beside latents Marigold takes none such.
+        layout = torch.channels_last if call["latents"] is None else torch.contiguous_format
+        call["image"] = lefts_01.contiguous(memory_format=layout)
         run = GuidedRun(
             self, prior, guidance, evidence, call, grid, rounds, callback, tiny=tiny, held=held, warm=warm
         )
@@ -180,12 +180,6 @@ class GuidedCall(_Stock):
             twin = copy.copy(self)
         twin.__class__ = _stock_class(type(self))
         twin.save_pretrained(*args, **kwargs)
-
-
-def native_images(image: Any, device: torch.device) -> Tensor:
-    """Left image(s) in any form that the stock call takes: ``(N, 3, H, W)`` float32 in [0, 1], as large."""
-    as_given = MarigoldImageProcessor(vae_scale_factor=1, do_normalize=False)
-    return as_given.preprocess(image, 0, device=device, dtype=torch.float32)[0].contiguous()
 
 
 def _bind(stock_call: Callable[..., Any], *args: Any, **kwargs: Any) -> dict[str, Any]:

@@ -277,11 +277,9 @@ def _latents_of(answer: Any, latents: Tensor) -> Tensor:
     if not isinstance(answer, Mapping):
         bad_type(name, "a dict or None", answer, cure)
     answered = answer.get("latents", latents)
-    if not isinstance(answered, Tensor):
-        bad_type(f"latents in {name}", "a tensor", answered, cure)
-    if answered.shape != latents.shape:
-        got = f"shape {tuple(answered.shape)}"
-        bad_value(f"latents in {name}", f"of shape {tuple(latents.shape)}", got, cure)
+    shape = tuple(answered.shape) if isinstance(answered, Tensor) else type(answered).__name__
+    if shape != tuple(latents.shape):
+        bad_value(f"latents in {name}", f"a tensor of shape {tuple(latents.shape)}", f"{shape}", cure)
     answered = answered.to(latents)
     if not answered.isfinite().all():
         bad_value(f"latents in {name}", "finite", "NaN or infinity", cure)

@@ -32,8 +32,8 @@ from geodiff_plugin.matching import build_cost_volume, points_to_matches, with_p
 from geodiff_plugin.matching.build import mirrored_pose_preferred
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches, reject_reflections
-from geodiff_plugin.pose.refine import Displacement, fit_displacement, straightened
-from geodiff_plugin.pose.scale import find_scale, refined_scale
+from geodiff_plugin.pose.estimate import find_scale
+from geodiff_plugin.pose.refine import Displacement, fit_displacement, refined_scale, straightened
 from geodiff_plugin.pose.tracks import Tracks, project_tracks, solve_inverse_depth
 from geodiff_plugin.runtime.confidence import depth_confidence, reprojection
 from geodiff_plugin.scale.points import (

@@ -159,8 +159,11 @@ def test_a_callback_sees_and_replaces(guided):
     ("answer", "message"),
     [
         ([1.0], "the answer of callback_on_step_end must be a dict or None"),
-        ({"latents": None}, "latents in the answer of callback_on_step_end must be a tensor; got NoneType"),
-        ({"latents": torch.zeros(1, 2, 24, 32)}, r"of shape \(1, 4, 24, 32\); got shape \(1, 2, 24, 32\)"),
+        (
+            {"latents": None},
+            "latents in the answer of callback_on_step_end must be a tensor of.*; got NoneType",
+        ),
+        ({"latents": torch.zeros(1, 2, 24, 32)}, r"of shape \(1, 4, 24, 32\); got \(1, 2, 24, 32\)"),
         ({"latents": torch.full((1, 4, 24, 32), torch.nan)}, "must be finite; got NaN or infinity"),
     ],
 )

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin.guidance.evidence import pose_views
+from geodiff_plugin.pose.refine import refine_views
 from geodiff_plugin.types import CameraView
 from tests.conftest import guided_call, plane_pair
 from tests.contracts.tiny_priors import TINY
@@ -80,7 +80,7 @@ def test_a_refined_pose_does_not_depend_on_them(rendered):
 
     def compute():
         T = torch.from_numpy(np.linalg.inv(E)).to(torch.float32)
-        found, report = pose_views(left, [CameraView(right, K.float(), T)], K.float())
+        found, report = refine_views(left, [CameraView(right, K.float(), T)], K.float())
         assert report.status == "refined"
         return found[0].T_right_from_left.numpy()
 
