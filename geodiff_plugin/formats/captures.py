@@ -52,20 +52,7 @@ NO_POSE_CURE = "Such frames are skipped; delete the others' poses as well to hav
 
 @dataclass(frozen=True, eq=False)
 class CaptureFrame:
-    """One frame of a capture.
-
-    Attributes:
-        name: stem of the image's file, or the number of a video's frame; unique in the capture.
-        image: the image's file, or the video.
-        K: ``(3, 3)`` pixels of the image as it is.
-        size: ``(width, height)``.
-        E: ``(4, 4)`` camera-to-world in OpenCV's axes, or ``None`` where no pose is given.
-        lens: its distortion, ``None`` for none.
-        depth: a 16-bit PNG with depth that the capture names for it, or ``None``.
-        depth_per_m: its values a metre.
-        index: number of the frame in a video, ``None`` for an image file.
-        points: ``(n, 3)`` that it sees of a COLMAP model, in the world of ``E``, or ``None``.
-    """
+    """One frame; ``E`` is its camera-to-world pose in OpenCV's axes, ``None`` where none is given."""
 
     name: str
     image: Path
@@ -81,14 +68,7 @@ class CaptureFrame:
 
 @dataclass(frozen=True, eq=False)
 class CaptureFiles:
-    """What a capture's files say.
-
-    Attributes:
-        frames: in order of the capture.
-        kind: what the files are, in words.
-        unit: ``"m"``, or ``None`` where lengths are in no known unit.
-        notes: sentences for the user, such as frames without image.
-    """
+    """What a capture's files say: frames in order, ``unit`` ``"m"`` or ``None``, notes for the user."""
 
     frames: tuple[CaptureFrame, ...]
     kind: str
@@ -107,18 +87,10 @@ def read_capture(
     fov: float | None = None,
     trajectory: str | os.PathLike[str] | None = None,
 ) -> CaptureFiles:
-    """Read the frames of a capture; the layout is recognised.
+    """Read the frames of a capture, whatever its layout (docs/how-to/captures.md).
 
-    Args:
-        path: COLMAP model or project, ``transforms.json`` or its folder, folder of 7-Scenes, ScanNet or TUM
-            RGB-D, video (with ``trajectory``), or folder of images without poses.
-        K: ``(3, 3)`` intrinsics in pixels, for layouts that have none; goes before those of the files.
-        fov: horizontal field of view in degrees, likewise.
-        trajectory: of a video: lines ``seconds tx ty tz qx qy qz qw``, camera-to-world, OpenCV's axes.
-
-    Raises:
-        FileNotFoundError: nothing there.
-        ValueError: nothing that is a capture; fewer than two frames; damaged files, named.
+    ``K`` and ``fov`` (horizontal, degrees) are for layouts without intrinsics, and go before the files'.
+    ``trajectory`` has a video's lines ``seconds tx ty tz qx qy qz qw``, camera-to-world, OpenCV's axes.
     """
     source = Path(path)
     if not source.exists():

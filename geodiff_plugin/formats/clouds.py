@@ -42,9 +42,8 @@ def flying_points(depth_m: np.ndarray) -> np.ndarray:
     """Points that hang in the air between a near and a far surface, ``(H, W)`` boolean.
 
     A pixel of ``depth_m``, ``(H, W)`` metres, flies when fewer than three of its eight neighbours have its
-    depth, within 4 % of the nearer of the two. Both sides of a clean edge stay. Things one pixel wide and
-    surfaces seen at a grazing angle (a road near the horizon) go too. What is not finite or not above 0
-    supports no neighbour and never flies.
+    depth within 4 % of the nearer: things one pixel wide and surfaces at a grazing angle go too. Unknown
+    depth (not finite, or not above 0) never flies.
     """
     depth_m = np.asarray(depth_m, dtype=np.float32)
     use = _usable(depth_m, None)
@@ -65,10 +64,7 @@ def flying_points(depth_m: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Coloured points in the left camera's frame, x right, y down, z forward.
-
-    ``points_m`` is ``(N, 3)`` float64 metres, ``colours`` ``(N, 3)`` uint8 RGB.
-    """
+    """Points ``(N, 3)`` float64 metres in the left camera's frame, their colours ``(N, 3)`` uint8 RGB."""
 
     points_m: np.ndarray
     colours: np.ndarray
@@ -86,17 +82,11 @@ def make_cloud(
 ) -> Cloud:
     """The points of a depth map, one a pixel, row by row; none where it is not finite or not above 0.
 
-    Args:
-        depth_m: ``(H, W)`` metres, z of the left camera.
-        image_01: ``(H, W, 3)`` in [0, 1], the colours.
-        K: ``(3, 3)`` pixels of this grid.
-        valid: ``(H, W)`` boolean; only these become points, such as ``~flying_points(depth_m)``.
+    ``depth_m`` is ``(H, W)`` metres along z, ``image_01`` ``(H, W, 3)`` in [0, 1], ``K`` ``(3, 3)`` pixels of
+    this grid, ``valid`` ``(H, W)`` boolean. A pixel on the principal point at 2 m is (0, 0, 2).
 
     Raises:
         ValueError: shapes that do not fit, or a K that is none.
-
-    Convention:
-        A pixel on the principal point at 2 m is (0, 0, 2).
     """
     parts = list(_cloud_strips(depth_m, image_01, K, valid))
     return Cloud(np.concatenate([p.points_m for p in parts]), np.concatenate([p.colours for p in parts]))
@@ -162,12 +152,9 @@ def write_glb(
     cloud: Cloud,
     cameras: Sequence[tuple[np.ndarray, np.ndarray, tuple[int, int]]] = (),
 ) -> None:
-    """Write a cloud and its cameras as GLB, whole or not at all.
+    """Write a cloud, which may be empty, and its cameras as GLB, whole or not at all.
 
-    Args:
-        path: the file.
-        cloud: the points; an empty one is written as a scene without points.
-        cameras: ``(K, E, (width, height))`` of every camera to draw, E its pose in the left camera's frame.
+    ``cameras`` has ``(K, E, (width, height))`` of those to draw, E the pose in the left camera's frame.
 
     Convention:
         glTF's axes, in metres: a point 1 m to the right of, above and before the camera is (1, 1, -1).

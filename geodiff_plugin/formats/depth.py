@@ -60,10 +60,7 @@ def row_strips(height: int, width: int) -> Iterator[slice]:
 
 
 def read_pfm(path: PathLike, name: str = "map") -> np.ndarray:
-    """The ``(H, W)`` float32 of a grey portable float map, top row first, unlike the file.
-
-    Infinity and 0, which data sets use for "unknown", stay as they are.
-    """
+    """The ``(H, W)`` float32 of a grey portable float map, top row first, unlike the file."""
     file = check_file(path, name, "a PFM file")
     with open(file, "rb") as stream:
         kind = stream.readline(8).strip()
@@ -108,10 +105,7 @@ def write_depth_npy(path: PathLike, depth_m: np.ndarray) -> None:
 
 
 def depth_mm(depth_m: np.ndarray) -> np.ndarray:
-    """Metres ``(H, W)`` as whole millimetres of 16 bits, as ROS' ``16UC1`` and RGB-D data sets have it.
-
-    0 where not finite, under half a millimetre or beyond 65.535 m.
-    """
+    """Metres ``(H, W)`` as uint16 millimetres; 0 where not finite, under 0.5 mm or beyond 65.535 m."""
     depth_m = _check_map(depth_m)
     whole = np.empty(depth_m.shape, dtype=np.uint16)
     for rows in row_strips(*depth_m.shape):
@@ -132,10 +126,7 @@ def write_depth_mm(path: PathLike, depth_m: np.ndarray) -> int:
 def read_depth_png(
     path: PathLike, units_per_m: float = 1000.0, name: str = "depth"
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth or disparity of a 16-bit PNG with so many units in a metre or pixel (KITTI has 256).
-
-    ``(H, W)`` float32 metres or pixels, and the ``(H, W)`` boolean mask of where it is known, which is not 0.
-    """
+    """``(H, W)`` float32 of a 16-bit PNG with so many units a metre or pixel, and where it is not 0."""
     with open_image(path, name, "a 16-bit PNG file") as image:
         mode, values = image.mode, np.asarray(image)
     if not mode.startswith("I"):
@@ -145,11 +136,7 @@ def read_depth_png(
 
 
 def read_map(path: PathLike, name: str = "map") -> np.ndarray:
-    """The ``(H, W)`` map of a depth model, in whatever unit and space it is.
-
-    A file ``.npy``; ``.npz`` with ``depth``, or a single array; ``.pfm``; or a 16-bit ``.png``. Axes of
-    length 1 are dropped. NaN where it is not finite, and where a PNG has 0.
-    """
+    """The ``(H, W)`` map of a depth model, in its own unit and space; NaN where unknown."""
     file = check_file(path, name, MAP_FILES)
     kind = file.suffix.lower()
     if kind == ".png":
@@ -176,24 +163,12 @@ def read_points(
     scale: float | None = None,
     calibration: Sequence[PathLike] = (),
 ) -> np.ndarray:
-    """Read depths that are known, of the left image.
+    """Read known depths of the left image: ``(H, W)`` float32 metres, 0 where unknown, or ``(N, 3)``.
 
-    Args:
-        path: a map of the left image, 0 or not finite where nothing is known: 16-bit PNG of millimetres, PFM
-            or two-dimensional ``.npy`` of metres. Or points, metres, in the left camera's frame (x right, y
-            down, z forward): ``N x 3``, ``N x 4`` or ``N x 6`` as ``.npy`` or text (blanks or commas), of
-            which those columns count that a heading names x, y and z, else the first three; ``.ply``; KITTI's
-            velodyne ``.bin``.
-        name: the argument that it came in, for messages.
-        scale: units of the file in a metre, > 0, for any kind: 1000 for millimetres, 256 for KITTI's PNG.
-        calibration: of a ``.bin``: KITTI's object ``calib/N.txt``, or ``calib_velo_to_cam.txt`` with
-            ``calib_cam_to_cam.txt``.
-
-    Returns:
-        ``(H, W)`` float32 metres, 0 where unknown, or ``(N, 3)`` float32 metres.
-
-    Raises:
-        OSError, ValueError: no readable file, one of another kind, or one that does not decode.
+    A map is a 16-bit PNG of millimetres, a PFM or ``.npy`` of metres. Points are metres in the left camera's
+    frame (x right, y down, z forward): ``.npy`` or text of 3, 4 or 6 columns, or with a heading that names x,
+    y and z; ``.ply``; KITTI's velodyne ``.bin``, with its ``calibration``. ``scale`` is the units of the file
+    in a metre: 1000 for millimetres, 256 for KITTI's PNG.
     """
     file = check_file(path, name, "a file of known depths")
     if scale is not None:
@@ -344,10 +319,7 @@ def _baseline(E: np.ndarray, name: str, got: str) -> float:
 def disparity_of_depth(
     depth_m: np.ndarray, K_left: np.ndarray, K_right: np.ndarray, E: np.ndarray
 ) -> np.ndarray:
-    """Disparity in pixels of a rectified rig, ``fx baseline / Z - doffs``; infinity where depth is unknown.
-
-    ``depth_m`` is ``(H, W)`` in the unit of ``E``; the intrinsics are in its pixels.
-    """
+    """Disparity in pixels of a rectified rig, ``fx baseline / Z - doffs``; infinity where unknown."""
     shift = K_left[0, 0] * _baseline(E, "a submission", "a pair with another pose")
     known = np.isfinite(depth_m) & (depth_m > 0)
     inverse = np.where(known, 1.0 / np.where(known, depth_m, 1.0), np.inf)
@@ -357,12 +329,10 @@ def disparity_of_depth(
 def depth_of_disparity(
     path: PathLike, rig: Rig, size: tuple[int, int], name: str = "disparity"
 ) -> np.ndarray:
-    """Depths ``(H, W)``, metres, by a disparity map of the left image, from a stereo network or a sensor.
+    """Depths ``(H, W)``, metres, ``fx baseline / (d + doffs)``, of a disparity map; 0 where unknown.
 
-    The map, of ``read_map``, may be one of the image scaled: its disparities grow with its width, and every
-    pixel takes the nearest. A PNG holds 256 units a pixel, as KITTI's. ``rig`` is rectified, in metres, its K
-    for images of ``size``, ``(width, height)``. The depth is ``fx baseline / (d + doffs)``; 0 where the
-    disparity is not finite or 0, or nothing is in front of the cameras.
+    The map may be one of the image scaled: its disparities grow with its width, and every pixel takes the
+    nearest. A PNG holds 256 units a pixel, as KITTI's. ``rig`` is rectified, its K for images of ``size``.
     """
     baseline_m = _baseline(rig.E, name, f"the rig of {rig.source}")
     if rig.unit is None:

@@ -38,11 +38,7 @@ MATRIX = "a 3x3 K or a 4x4 (or 3x4) E, as text of numbers or .npy"
 
 
 def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") -> Path:
-    """The path of an existing, readable, non-empty file.
-
-    ``name`` is the argument that it came in and ``what`` what is expected there, for the message: TypeError,
-    FileNotFoundError, IsADirectoryError, PermissionError, or ValueError where empty, or a pipe or a device.
-    """
+    """The path of an existing, readable, non-empty file; messages name the argument and what it is."""
     if not isinstance(path, (str, os.PathLike)):
         bad_type(name, f"the path of {what}", path)
     file, shown = Path(path), quoted(path)
@@ -63,10 +59,7 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
 
 @contextmanager
 def open_image(path: str | os.PathLike[str], name: str, what: str = "an image file") -> Iterator[Image.Image]:
-    """Open an image file with Pillow; no pixel is read yet.
-
-    What is no image, too large, or damaged, which may show in the block only, is refused.
-    """
+    """Open an image file with Pillow; what is none, or damaged, as the block may find, is refused."""
     from PIL import Image, UnidentifiedImageError
 
     file = check_file(path, name, what)
@@ -104,10 +97,9 @@ def read_text(path: str | os.PathLike[str], name: str, what: str = "a text file"
 
 
 def read_rows(path: str | os.PathLike[str], name: str, what: str) -> list[list[str]]:
-    """The words of every line of a text that has any, without remarks behind ``#`` and ``//``.
+    """The words of every line that has any, without remarks behind ``#`` and ``//``, quotes and separators.
 
-    Blanks, commas, semicolons and quotes stand between words. Decimal commas are refused, as ``1,5 2,5 3,0``
-    would be read as six numbers; ``1,2`` alone in a line may be two columns.
+    Decimal commas are refused: ``1,5 2,5 3,0`` would be six numbers; ``1,2`` alone may be two columns.
     """
     rows = []
     for line in read_text(path, name, what).replace('"', "").splitlines():
@@ -151,11 +143,7 @@ def read_npy(path: Path, name: str, expected: str) -> np.ndarray:
 
 
 def read_matrix(path: str | os.PathLike[str], name: str = "matrix") -> np.ndarray:
-    """A camera matrix or a pose from a file, ``(3, 3)`` or ``(4, 4)`` float64.
-
-    The file is ``.npy`` or text: rows of numbers, or all 9, 12 or 16 in one row, in brackets or not. A 3x4
-    pose gets the row 0 0 0 1. Whether the matrix is a K or an E is checked where it is used.
-    """
+    """A K ``(3, 3)`` or a pose ``(4, 4)``, float64, from ``.npy`` or text: rows, or all numbers in one."""
     import numpy as np
 
     file = check_file(path, name, MATRIX)

@@ -125,13 +125,8 @@ def picture_size(value: Any, name: str) -> tuple[int, int]:
 def as_image_01(value: Any, name: str) -> torch.Tensor:
     """An image from memory as a tensor ``(3, H, W)`` float32 in [0, 1] on the CPU; not differentiable.
 
-    A PIL image is taken as it lies in memory, as diffusers does; a pending EXIF turn, a fourth channel, which
-    is dropped, and 16 bits of which few are used get a warning. One channel is repeated.
-
-    Args:
-        value: PIL image; numpy ``(H, W, C)`` or ``(H, W)``, or torch ``(C, H, W)``, of uint8, uint16 or
-            float in [0, 1].
-        name: the argument that it came in, for messages.
+    ``value`` is a PIL image, as it lies in memory; numpy ``(H, W, C)`` or ``(H, W)``, or torch ``(C, H, W)``,
+    of uint8, uint16 or float in [0, 1]. One channel is repeated, a fourth dropped with a warning.
 
     Raises:
         TypeError: none of these types.

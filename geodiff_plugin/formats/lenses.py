@@ -44,13 +44,10 @@ def intrinsics_from_fov(fov_deg: float, size: tuple[int, int]) -> np.ndarray:
 def intrinsics_from_exif(
     source: str | os.PathLike[str] | Image.Image, name: str
 ) -> tuple[np.ndarray, list[str]]:
-    """K of a photograph: of a file for its upright pixels, of an image in memory for its pixels as they lie.
+    """K of a photograph, to a few per cent, and sentences about what was assumed.
 
-    A focal length in 35 mm equivalent is taken by the diagonal; else a focal length in mm with the resolution
-    of the sensor. Both are known to a few per cent.
-
-    Returns K ``(3, 3)`` in pixels, and sentences about what was assumed; refuses an image without a focal
-    length, or one that was cropped since.
+    Of a file for its upright pixels, of an image in memory for its pixels as they lie; refused without a
+    focal length, or where the image was cropped since.
     """
     if isinstance(source, Image.Image):
         return _of(source, name)
@@ -61,10 +58,7 @@ def intrinsics_from_exif(
 
 
 def warn_of_other_lens(source: str | os.PathLike[str] | Image.Image, K: np.ndarray, name: str) -> None:
-    """Warn of a focal length that contradicts the image's own EXIF, which two rectified views cannot tell.
-
-    Nothing is said of an image without a focal length, or one that was cropped or zoomed digitally.
-    """
+    """Warn of a focal length that contradicts the EXIF data of an uncropped image."""
     try:
         theirs, notes = intrinsics_from_exif(source, name)
     except InputError:
@@ -149,10 +143,9 @@ def _as_taken(straight_px: np.ndarray, K: np.ndarray, distortion: Distortion) ->
 
 
 def undistorted_pixels(pixels: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
-    """Where pixels of the image as it was taken lie in the image that ``undistorted`` makes of it.
+    """Where pixels ``(N, 2)`` of the image as taken lie in that of ``undistorted``, with the same K.
 
-    ``pixels`` are ``(N, 2)`` x and y, the centre of the first pixel at (0, 0), ``K`` is of both images. The
-    result is ``(N, 2)`` float64, also outside of the image; NaN where the model sends no ray to a pixel.
+    Float64, x and y, also outside of the image; NaN where the model sends no ray to a pixel.
     """
     taken, K = np.asarray(pixels, np.float64).reshape(-1, 1, 2), np.asarray(K, np.float64)
     straight, far = taken.copy(), np.ones(len(taken), bool)
@@ -175,11 +168,7 @@ def undistorted_pixels(pixels: np.ndarray, K: np.ndarray, distortion: Distortion
 
 
 def undistorted_points(depth_m: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
-    """The known depths of an image as it was taken, as points; no two are mixed, and none is rounded.
-
-    ``depth_m`` is ``(H, W)`` metres along the optical axis, 0 or not finite where unknown. The result is
-    ``(N, 3)`` float32 metres in the camera's frame, without those that no ray of the lens model belongs to.
-    """
+    """Known depths ``(H, W)`` metres of an image as taken as points ``(N, 3)`` of the camera, unmixed."""
     rows, columns = np.nonzero(np.isfinite(depth_m) & (depth_m > 0))
     straight = undistorted_pixels(np.stack([columns, rows], axis=1), K, distortion)
     rays = np.concatenate([straight, np.ones((len(straight), 1))], axis=1) @ np.linalg.inv(K).T

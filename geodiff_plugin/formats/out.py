@@ -1,7 +1,4 @@
-"""Output: a file or a folder appears whole or not at all, and what cannot be written is said before the work.
-
-Nothing here imports torch: what is wrong with a folder is said at once.
-"""
+"""Output: a file or a folder appears whole or not at all; what cannot be written is said before the work."""
 
 from __future__ import annotations
 
@@ -36,10 +33,7 @@ Result = TypeVar("Result")
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path beside ``path``, of its suffix; rename it to ``path`` when the block ends well.
-
-    On any error, Ctrl-C included, it is removed, and an older file at ``path`` stays as it was.
-    """
+    """A temporary path beside ``path``, renamed to it when the block ends well, else removed."""
     target = Path(path)
     if os.path.isdir(target):
         raise FolderError(f"The output must be a file; got the folder {target}. Name a file inside of it.")
@@ -106,10 +100,7 @@ def free_folder(default: Path) -> Path:
 
 
 def _take(hidden: Path, stack: ExitStack) -> bool:
-    """Lock a hidden folder until ``stack`` is closed; ``False`` where another process has it.
-
-    The kernel gives a lock back when its process ends, however it ends.
-    """
+    """Lock a hidden folder until ``stack`` is closed, or the process ends; ``False`` where another has it."""
     file = stack.enter_context(open(hidden / LOCK, "ab"))
     if not fcntl:
         return True
@@ -140,10 +131,8 @@ def _files_of_report(folder: Path) -> set[str]:
 class OutFolder:
     """A folder that this process alone writes to, from before the work until the result is in it.
 
-    Whatever speaks against it is said on entry. ``path`` is as typed; it need not exist. None of ``inputs``,
-    the files that the run reads, may lie in it. With ``overwrite`` it may hold files: those that its report
-    lists as an earlier run's go where the new run does not write them; all others stay. ``option`` is what
-    it was given as, for messages.
+    Whatever speaks against it is said on entry. None of ``inputs``, which the run reads, may lie in it. With
+    ``overwrite`` it may hold files: an earlier run's, by its report, go; all others stay.
     """
 
     def __init__(
@@ -194,10 +183,9 @@ class OutFolder:
             print(line, file=sys.stderr, flush=True)
 
     def write(self, fill: Callable[[Path], Result]) -> Result:
-        """Let ``fill`` write into an empty folder beside the place, whose files are then moved.
+        """Let ``fill`` write into an empty folder, whose files are then moved; returns what ``fill`` does.
 
-        A new folder appears by one rename. In one that exists each file is replaced by one rename, then what
-        only an earlier run wrote goes, and the report is replaced last. Returns what ``fill`` does.
+        A new folder appears by one rename. In one that exists each file is replaced, the report last.
         """
         files = self._staging / FILES
         try:

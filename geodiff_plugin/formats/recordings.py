@@ -207,10 +207,7 @@ def _decoded(message: Any, path: Path) -> np.ndarray:
 
 
 def stereo_calibration(path: Path, topics: tuple[str, str]) -> tuple[list[str], str]:
-    """The ``camera_info`` beside two topics as files of ``robots.read_ros``, and the left one's ``frame_id``.
-
-    Topics with "rect" in their name are of rectified images, others of the images as taken.
-    """
+    """The ``camera_info`` beside two topics as files of ``read_ros``, and the left one's ``frame_id``."""
     texts, frames = [], []
     with _open_bag(path) as reader:
         for topic in topics:
@@ -233,11 +230,10 @@ def stereo_calibration(path: Path, topics: tuple[str, str]) -> tuple[list[str], 
 def write_depth_bag(
     path: Path, frames: Iterable[tuple[Stamp, np.ndarray, np.ndarray]], frame_id: str, encoding: str
 ) -> int:
-    """Write ``/depth/image`` and ``/depth/camera_info``, one of each a frame, whole or not at all; how many.
+    """Write ``/depth/image`` and ``/depth/camera_info`` of all frames, whole or not at all; how many.
 
-    ``path`` ends in .mcap (ROS 2) or .bag (ROS 1). A frame is the stamp, ``(H, W)`` metres and ``(3, 3)`` K
-    in pixels of an image; ``frame_id`` is that of the left camera. ``"16UC1"`` is whole millimetres, 0 where
-    unknown, ``"32FC1"`` metres, NaN where unknown.
+    ``path`` ends in .mcap (ROS 2) or .bag (ROS 1). A frame is the stamp, ``(H, W)`` metres and ``(3, 3)`` K.
+    ``"16UC1"`` is millimetres, 0 where unknown, ``"32FC1"`` metres, NaN where unknown.
     """
     from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore

@@ -56,11 +56,8 @@ class CameraChoice:
 class Camera:
     """One camera as a file describes it; nothing is checked yet.
 
-    Attributes:
-        K: ``(3, 3)`` pixels, the centre of the first pixel at (0, 0).
-        size: ``(width, height)`` that ``K`` is for; ``None``, or a pair of ``None``, if unknown.
-        coefficients: of the lens, in OpenCV's order; empty for none.
-        model: the file's name of the lens model (``LENS_MODELS``).
+    ``K`` is in pixels of images of ``size``, which may be unknown, the centre of the first pixel at (0, 0);
+    ``coefficients`` are in OpenCV's order, empty for no lens; ``model`` is the file's name (``LENS_MODELS``).
     """
 
     K: np.ndarray
@@ -75,12 +72,10 @@ class CalibrationFormat:
 
     Attributes:
         summary: the format, for messages.
-        mark: the regular expression that a text of this format, and of none before it in the table, has;
-            ``^`` and ``$`` are ends of lines.
-        read: what a file says, by ``make_rig``. It may raise whatever a missing entry raises, which
-            ``read_calibration`` turns into a sentence with the file's name.
+        mark: regular expression that its texts have, and none of a format before it; ``^`` begins a line.
+        read: the rig of the texts, by ``make_rig``; it may raise whatever a missing entry raises.
         file_counts: how many files may describe one pair.
-        uses_cameras: whether a file may hold more than two cameras, so that ``cameras`` has a meaning.
+        uses_cameras: whether a file may hold more than two cameras.
         by_image: whether it has a pose, in no known unit, for each of many images, found by their names.
     """
 
@@ -179,11 +174,7 @@ def two_cameras(
 
 
 def names_of_pair(names: Collection[str], choice: CameraChoice) -> tuple[str, str]:
-    """The names in a file of ``choice.image_names``.
-
-    Names of the file may hold folders, and may lack the suffix. A path fits a name that it ends with, or that
-    ends with it; of several the one with the most folders in common is taken.
-    """
+    """The names in a file of both images; they and the paths may lack folders, or a suffix."""
     if choice.image_names is None:
         bad_value("image_names", "given, as ('left.jpg', 'right.jpg'), for a file of many images", "none")
     left, right = (_named(names, str(wanted)) for wanted in choice.image_names)
@@ -257,11 +248,8 @@ def _pixels(size: Any, name: str) -> Size | None:
 def make_rig(left: Camera, right: Camera, pose: Any, *, rectified: bool = False) -> Rig:
     """A ``Rig`` of raw numbers: finite, in the right form, with whole pixels and lenses that OpenCV has.
 
-    ``pose`` is the right camera's in the left camera's frame, ``(4, 4)`` metres, or the baseline in metres of
-    a right camera that stands to the right. ``rectified`` images have no lens distortion.
-
-    Raises:
-        ValueError: what is wrong with which camera, or with the pose.
+    ``pose`` is the right camera's in the left camera's frame, ``(4, 4)`` metres, or the baseline of a right
+    camera that stands to the right. ``rectified`` images have no lens distortion.
     """
     E = np.eye(4)
     if np.ndim(pose) == 0:
@@ -279,10 +267,7 @@ def make_rig(left: Camera, right: Camera, pose: Any, *, rectified: bool = False)
 
 
 def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any = None) -> Rig:
-    """The rig of two rectified ``(3, 4)`` projections ``K [I | t]`` that share one frame.
-
-    A camera with ``K [I | t]`` has its centre at ``-t``, so the pose's translation is ``t_left - t_right``.
-    """
+    """The rig of two rectified ``(3, 4)`` projections ``K [I | t]``, whose centres are ``-t``."""
     cameras, places = [], []
     for side, values, size in (("left", P_left, size_left), ("right", P_right, size_right)):
         P = array_of(values, (3, 4), f"the {side} projection")
@@ -303,11 +288,10 @@ def rig_from_parameters(
     cx_right: float | None = None,
     size: Size | None = None,
 ) -> Rig:
-    """A rectified rig from the numbers that a data sheet gives.
+    """A rectified rig from the numbers of a data sheet.
 
-    ``fx``, ``fy``, ``cx``, ``cy`` are in pixels, the centre of the first pixel at 0, of both images; the
-    right one has ``cx_right`` where that is given (``doffs``). The right camera stands ``baseline_m``
-    metres to the right. ``size`` is the ``(width, height)`` that these belong to, where known.
+    ``fx fy cx cy`` are in pixels of both images, the centre of the first pixel at 0; ``cx_right`` is the
+    right one's (``doffs``), which stands ``baseline_m`` metres to the right. ``size`` is (width, height).
 
     Raises:
         TypeError, ValueError: not finite numbers, or not above 0 where they must be.

@@ -60,10 +60,7 @@ def _yaml(text: str) -> Entries:
 
 
 def _storage(text: str) -> Entries:
-    """Every entry of an OpenCV file in YAML, XML or JSON, those of maps in it beside the others.
-
-    By key in small letters: matrices, numbers, lists of numbers as float64 arrays of one axis, and strings.
-    """
+    """The entries of an OpenCV file by key in small letters: numbers as flat arrays, and strings."""
     if "<opencv_storage" in text:
         if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
             bad_value("the file", "an OpenCV XML file", "a document type with entities", "Remove it.")
@@ -136,12 +133,9 @@ def _projection(info: Entries) -> np.ndarray:
 
 
 def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """Files of ``camera_calibration``, or the message as ``echo`` prints it, left file first.
+    """Files of ``camera_calibration``, or the message as ``echo`` prints it: the rectified images, by ``P``.
 
-    They stand for the rectified images (``image_rect``), of which ``P`` is; ``P[0, 3]`` of the right camera
-    is ``-fx * baseline``, in metres. Those that say ``rectified: false``, as ``geodiff depth`` writes them
-    for a bag, stand for the images as taken: ``K`` and ``D``, posed by ``R``, which turns a camera's points
-    to the rectified frame.
+    Those that say ``rectified: false`` (``recordings.stereo_calibration``) stand for the images as taken.
     """
     infos = [_yaml(text) for text in texts]
     sizes = [(i.get("image_width", i.get("width")), i.get("image_height", i.get("height"))) for i in infos]
@@ -171,11 +165,9 @@ def _orb_camera(entries: Entries, name: str, kind: str) -> Camera:
 
 
 def read_orb_slam(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """The images as taken, by ``Stereo.T_c1_c2`` (or ``Tlr``), else rectified images.
+    """The images as taken, by ``Stereo.T_c1_c2`` (or ``Tlr``), else rectified images of one K, in metres.
 
-    Rectified images have one camera for both, and a baseline: ``Stereo.b``, or ``Camera.bf``, which is
-    fx times the baseline. Lengths are metres. Images have ``Camera.width`` and ``Camera.height``;
-    ``Camera.newWidth`` is what ORB-SLAM shrinks them to, and is not read.
+    ``Camera.newWidth`` is what ORB-SLAM shrinks images to, and is not read.
     """
     entries = _storage(texts[0])
     kind = entries.get("camera.type", "PinHole")
@@ -251,12 +243,9 @@ def _lenses(arrays: Arrays, named: Entries) -> list[Any]:
 
 
 def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """One file, or ``intrinsics`` and ``extrinsics`` in any order.
+    """``P1, P2`` of the rectified images, else ``M1, M2, R, T`` and ``D1, D2``; ``NAMES`` has other names.
 
-    ``P1, P2`` stand for the rectified images and come first, whatever the lens distortion before them was.
-    Without them ``M1, M2, R, T`` are taken, with the distortion ``D1, D2`` of OpenCV's model; ``R, T`` take
-    left points to right ones. Lengths are taken as metres: OpenCV keeps the unit of the chessboard's squares,
-    and the file does not say it. ``NAMES`` has what else they may be called.
+    Lengths are taken as metres: OpenCV keeps the unit of the chessboard's squares, and no file says it.
     """
     arrays = [item for text in texts for item in _storage(text).items() if isinstance(item[1], np.ndarray)]
     named = _named(arrays)

@@ -71,11 +71,7 @@ def model_files(folder: Path) -> tuple[Path, Path] | None:
 
 
 def calibration_text(path: str | os.PathLike[str]) -> str:
-    """The text of a calibration file, of a COLMAP model without its points.
-
-    Binary models are read as the text that they stand for. A file that did not change is not read again:
-    every pair of a run asks for it.
-    """
+    """The text of a calibration file, of a COLMAP model without its points; kept until the file changes."""
     file = check_file(path, "calibration", "a calibration file")
     state = file.stat()
     return _calibration_text(file.absolute(), state.st_size, state.st_mtime_ns)
@@ -196,10 +192,7 @@ def _binary_points(path: Path) -> Iterator[tuple[Sequence[Any], Sequence[Any]]]:
 
 
 def read_colmap(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """The two images of ``choice.image_names``; both files in any order.
-
-    Lengths keep the model's unit, which is no metre: one measured distance gives it (``baseline_m``).
-    """
+    """The two images of ``choice.image_names``, both files in any order, in the model's unit."""
     by_kind = {CAMERA.search(text) is not None and IMAGES_MARK not in text: text for text in texts}
     if len(by_kind) != 2:
         bad_value("the files", "cameras.txt and images.txt", "two of one kind")
@@ -274,12 +267,10 @@ def nerf_pose(frame: Frame) -> np.ndarray:
 
 
 def read_nerf(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """The two images of ``choice.image_names``; a frame's entries go before the file's.
+    """The two images of ``choice.image_names``, in the unit of the poses.
 
-    Lengths keep the unit of the poses; ``applied_transform`` turns the world and changes no relative pose.
-
-    Source: data conventions of nerfstudio's documentation, its ``colmap_utils.py`` (intrinsics are written as
-        COLMAP has them) and ``cameras.py`` (rays through pixel + 0.5); ``nerf_loader.cu`` of instant-ngp.
+    Source: data conventions of nerfstudio's documentation, its ``colmap_utils.py`` and ``cameras.py`` (rays
+        through pixel + 0.5); ``nerf_loader.cu`` of instant-ngp.
     """
     frames = nerf_frames(texts[0])
     left, right = (frames[name] for name in names_of_pair(frames, choice))
@@ -300,23 +291,18 @@ def write_colmap(
     cloud: Cloud,
     seen: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> None:
-    """Write a text model, for splatting and MVS.
+    """Write a text model into an existing folder, for splatting and MVS.
 
-    Args:
-        folder: an existing one.
-        views: ``(name, K, E, (width, height))`` of every image; K in pixels, E its camera-to-world pose.
-            Names have no blanks, as COLMAP's text allows none.
-        cloud: the points in the same world; without ``seen`` at most 100 000 of them are written.
-        seen: of every image the pixels ``(n, 2)`` at which it sees points, and their rows ``(n,)`` in the
-            cloud; ``None`` for points without tracks. Programs choose pairs of images by them.
+    ``views`` has ``(name, K, E, (width, height))`` of every image: no blanks in names, E camera-to-world.
+    ``seen`` has of every image the pixels ``(n, 2)`` at which it sees points, and their rows ``(n,)`` in the
+    cloud; without it at most 100 000 points are written, without tracks.
 
     Raises:
         ValueError: a name with a blank.
         OSError: the folder does not exist or is not writable.
 
     Convention:
-        World-to-camera, and the centre of the first pixel at (0.5, 0.5), as COLMAP has it: cx and cy are
-        half a pixel more than in K.
+        World-to-camera, and the centre of the first pixel at (0.5, 0.5): half a pixel more than in K.
     """
     check_colmap_names([name for name, *_ in views])
     cloud = cloud.thinned(MOST_POINTS) if seen is None else cloud

@@ -72,11 +72,7 @@ def _matrix(entries: dict[str, str], key: str) -> np.ndarray:
 
 
 def read_middlebury(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """``doffs`` is what the ground truth was made with, so ``cx0 + doffs`` goes before ``cam1``.
-
-    Convention:
-        ``doffs = cx1 - cx0``, so that Z = baseline * f / (disparity + doffs); the baseline is in millimetres.
-    """
+    """``doffs = cx1 - cx0`` is what the ground truth was made with, so it goes before ``cam1``."""
     entries = dict(ENTRY.findall(texts[0]))
     K_left = _matrix(entries, "cam0")
     K_right = _matrix(entries, "cam1") if "cam1" in entries else None
@@ -151,10 +147,9 @@ def read_mvsnet(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 
 
 def read_zed(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """The raw images of ``SN<number>.conf`` at the resolution of ``choice.image_size``.
+    """The raw images of ``SN<number>.conf`` at the resolution of ``choice.image_size``; millimetres.
 
-    Lengths are millimetres. ``R = Rodrigues(RX, CV, RZ)`` takes left directions to right ones, and
-    ``Baseline``, ``TY``, ``TZ`` point from the left camera to the right one: ``x_right = R x_left - T``.
+    ``R = Rodrigues(RX, CV, RZ)`` takes left directions to right ones: ``x_right = R x_left - T``.
 
     Source: calibration.hpp of stereolabs/zed-opencv-native.
     """
@@ -270,11 +265,10 @@ def _oak_links(cameras: Sockets, socket: int) -> dict[int, np.ndarray]:
 
 
 def read_oak(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """The rectified images (``rectifiedLeft``, ``rectifiedRight``), at ``choice.image_size``.
+    """The rectified images, at ``choice.image_size``, or the cameras as they stand; centimetres.
 
-    Where the file holds the rectifying rotations, both images are those of a pinhole with the right camera's
-    intrinsics, a baseline apart; that is what ``StereoDepth`` makes. Without them, or for other sockets, the
-    cameras stand as they are, with their lenses. Lengths are centimetres.
+    Where the file holds the rectifying rotations, both images have the right camera's K, as ``StereoDepth``
+    makes them.
     """
     data = json.loads(texts[0])
     cameras: Sockets = dict(data["cameraData"])  # pairs of a socket and its camera
