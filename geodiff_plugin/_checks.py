@@ -31,14 +31,6 @@ class MissingFileError(InputFileError, FileNotFoundError):
     """A file or folder that does not exist."""
 
 
-class FolderError(InputFileError, IsADirectoryError):
-    """A folder where a file is needed."""
-
-
-class ForbiddenFileError(InputFileError, PermissionError):
-    """A file that may not be read."""
-
-
 def quoted(got: object) -> str:
     """A given value as a single line of limited length, for a message."""
     text = " ".join(str(got).split())  # arrays are printed over several lines; file names may hold line ends
@@ -139,15 +131,11 @@ def check_choice(value: Any, name: str, choices: Any) -> Any:
     return value
 
 
-def check_range(value: Any, name: str) -> tuple[float, float] | None:
-    """``None`` or a pair ``0 < low < high``, as a tuple of floats."""
-    if value is None:
-        return None
-    try:
-        low, high = value
-        low, high = (float(check_number(v, name, -float("inf"), float("inf"))) for v in (low, high))
-    except (TypeError, ValueError, OverflowError):
-        bad_type(name, "None or a pair of numbers (low, high)", value)
-    if not (0 < low < high < float("inf")):
+def check_range(value: Any, name: str) -> tuple[float, float]:
+    """A pair of numbers ``0 < low < high``, as a tuple of floats."""
+    if not isinstance(value, (tuple, list)) or len(value) != 2:
+        bad_type(name, "a pair of numbers (low, high)", value)
+    low, high = (float(check_number(number, name, 1e-12, 1e12)) for number in value)
+    if low >= high:
         bad_value(name, "a pair with 0 < low < high", (low, high))
     return low, high

@@ -98,11 +98,7 @@ def _text(default: str, values: str, **more: str) -> Any:
 
 def _pair(default: tuple[float, float] | None, **more: str) -> Any:
     """Two numbers in metres, ``0 < low < high``; a list is taken for a tuple."""
-
-    def check(value: Any, name: str) -> tuple[float, float]:
-        return check_range(value, name) or bad_type(name, "a pair of numbers (low, high)", value)
-
-    return _knob(default, "pair with 0 < low < high, m", check, **more)
+    return _knob(default, "pair with 0 < low < high, m", check_range, **more)
 
 
 def _mapping(value: Any, name: str) -> Mapping[str, Any]:

@@ -15,7 +15,7 @@ from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin.cli.depth import Job
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.terminal import collected_warnings
-from geodiff_plugin.formats.files import open_image
+from geodiff_plugin.formats.files import upright_size
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.priors import load_prior
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
@@ -32,7 +32,6 @@ CAMERA_WAYS = {
 }
 #: A photograph of more is not decoded.
 MOST_MEGAPIXELS = 50
-ORIENTATION, LYING = 0x0112, 5
 
 
 class Stopped(Exception):
@@ -58,13 +57,11 @@ class Priors:
 
 def _upright_size(path: Path, name: str) -> tuple[int, int]:
     """``(width, height)`` of a photograph that is small enough to be decoded."""
-    with open_image(path, name) as image:  # the head alone
-        width, height = image.size
-        lying = image.getexif().get(ORIENTATION, 1) >= LYING
+    width, height = upright_size(path, name)
     if width * height > MOST_MEGAPIXELS * 1_000_000:
         expected = f"an image of at most {MOST_MEGAPIXELS} megapixels"
         bad_value(name, expected, f"{width}x{height}", "Scale it down first, and K with it.")
-    return (height, width) if lying else (width, height)
+    return width, height
 
 
 def options_of(

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from geodiff_plugin._checks import InputError, MissingFileError, bad_value
-from geodiff_plugin.formats.files import open_image, read_matrix, read_rows, read_text
+from geodiff_plugin.formats.files import read_matrix, read_rows, read_text, upright_size
 from geodiff_plugin.formats.lenses import intrinsics_from_exif, intrinsics_from_fov
-from geodiff_plugin.formats.recordings import count_frames, is_video
+from geodiff_plugin.formats.recordings import is_video, video_facts
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, lens_of, reading_whole, resized, rigid
 from geodiff_plugin.formats.sfm import (
     model_files,
@@ -47,7 +47,6 @@ TUM_DEPTH = 5000.0
 OF_COLMAP = ("colmap_im_id", "sharpness")
 #: Poses of a trajectory further from an image than this, in seconds, are not its own.
 FARTHEST_S = 0.05
-NO_POSE_CURE = "Such frames are skipped; delete the others' poses as well to have all poses estimated."
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,15 +121,8 @@ def _posed(frames: Sequence[CaptureFrame], kind: str) -> CaptureFiles:
     if not posed:
         return CaptureFiles(tuple(frames), kind, None)
     lost = [frame.name for frame in frames if frame.E is None]
-    return CaptureFiles(posed, kind, notes=_skipped(lost, "no pose", NO_POSE_CURE))
-
-
-def _size(path: Path) -> tuple[int, int]:
-    """Size of an image as it is read, turned by its EXIF orientation."""
-    with open_image(path, f"{path}") as image:
-        width, height = image.size
-        turned = image.getexif().get(0x0112, 1) >= 5
-    return (height, width) if turned else (width, height)
+    cure = "Delete the others' poses as well to have all of them estimated."
+    return CaptureFiles(posed, kind, notes=_skipped(lost, "no pose", cure))
 
 
 def _typed_K(typed: Typed, size: tuple[int, int]) -> np.ndarray | None:
@@ -144,7 +136,7 @@ def _framed(
     """A frame of an image file, its camera scaled to the image's size."""
     if not path.is_file():
         return CaptureFrame(path.stem, path, camera.K, (0, 0), E)
-    size = _size(path)
+    size = upright_size(path, f"{path}")
     K = _typed_K(typed, size)
     if K is None:
         K = resized(camera, size, f"{path}", "Is it a crop? Give --K.").K
@@ -194,7 +186,7 @@ def _transforms(path: Path, typed: Typed) -> CaptureFiles | None:
     for name, entries in nerf_frames(read_text(file, "PATH")).items():
         paths = [file.parent / f"{name}{suffix}" for suffix in ("", *IMAGES)]  # synthetic scenes leave it out
         image = next((path for path in paths if path.is_file()), paths[0])
-        camera = nerf_camera(entries, _size(image) if image.is_file() else None)
+        camera = nerf_camera(entries, upright_size(image, f"{image}") if image.is_file() else None)
         depth = file.parent / entries.get("depth_file_path", f"depth/{image.stem}.png")
         frames.append(_framed(image, camera, nerf_pose(entries), typed, depth))
         unit = None if any(key in entries for key in OF_COLMAP) else unit
@@ -275,14 +267,9 @@ def _trajectory(file: Path) -> Callable[[float], np.ndarray | None]:
 
 
 def _video(path: Path, typed: Typed) -> CaptureFiles | None:
-    import cv2
-
     if not (path.is_file() and is_video(path)):
         return None
-    count, video = count_frames(path, "PATH"), cv2.VideoCapture(str(path))
-    fps = video.get(cv2.CAP_PROP_FPS) or 30.0
-    size = (int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)))
-    video.release()
+    count, fps, size = video_facts(path, "PATH")
     K = _typed_K(typed, size)
     if K is None:
         bad_value("K", "given by --K or --fov", "none", "A video does not say its focal length.")
@@ -295,7 +282,7 @@ def _images(path: Path, typed: Typed) -> CaptureFiles | None:
     folders = [folder for folder in (path, path / "images") if folder.is_dir() and _images_in(folder)]
     frames = []
     for image in _images_in(folders[0]) if folders else []:
-        size = _size(image)
+        size = upright_size(image, f"{image}")
         K = _typed_K(typed, size)
         K = intrinsics_from_exif(image, image.name)[0] if K is None else K
         frames.append(CaptureFrame(image.stem, image, K, size))

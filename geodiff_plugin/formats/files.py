@@ -14,20 +14,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from geodiff_plugin._checks import (
-    FolderError,
-    ForbiddenFileError,
-    InputError,
-    MissingFileError,
-    bad_type,
-    bad_value,
-    quoted,
-)
+from geodiff_plugin._checks import InputError, InputFileError, MissingFileError, bad_type, bad_value, quoted
 
 if TYPE_CHECKING:  # what is wrong with a file is said before numpy is imported
     import numpy as np
     from PIL import Image
 
+#: EXIF's tag of how an image is turned or mirrored; from 5 on its sides change places.
+ORIENTATION = 0x0112
 #: A number whose decimals follow a comma, alone between blanks, semicolons or the ends of a line.
 DECIMAL_COMMA = re.compile(r"(?<![^\s;])[-+]?\d+,\d+(e[-+]?\d+)?(?![^\s;])", re.IGNORECASE)
 #: No calibration file is near this size; a larger one is something else.
@@ -43,15 +37,15 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
         bad_type(name, f"the path of {what}", path)
     file, shown = Path(path), quoted(path)
     if os.path.isdir(file):
-        raise FolderError(f"{name} must be {what}; got the folder {shown}. Name the file inside it.")
+        raise InputFileError(f"{name} must be {what}; got the folder {shown}. Name the file inside it.")
     if not os.path.exists(file):  # Path.exists() raises on a name that is too long
-        said = f"{name} must be {what}; got {shown}, which does not exist. Check the spelling."
-        raise MissingFileError(said)
+        raise MissingFileError(
+            f"{name} must be {what}; got {shown}, which does not exist. Check the spelling."
+        )
     if not file.is_file():
         bad_value(name, what, f"{shown}, which is a pipe or a device", "Save what it gives as a file first.")
     if not os.access(file, os.R_OK):
-        said = f"{name} must be {what} that you may read; got {shown}. Check its permissions."
-        raise ForbiddenFileError(said)
+        raise InputFileError(f"{name} must be {what} that you may read; got {shown}. Check its permissions.")
     if file.stat().st_size == 0:
         bad_value(name, what, f"{shown}, which is empty", "Was its download or copy cut off? Fetch it again.")
     return file
@@ -76,6 +70,14 @@ def open_image(path: str | os.PathLike[str], name: str, what: str = "an image fi
     except (Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError, zlib.error) as error:
         cure = "Is it cut off, or too large?"
         bad_value(name, "a whole image file", f"{file}, which does not decode ({error})", cure)
+
+
+def upright_size(path: str | os.PathLike[str], name: str) -> tuple[int, int]:
+    """``(width, height)`` of an image file as it is read, turned by its EXIF orientation."""
+    with open_image(path, name) as image:
+        width, height = image.size
+        turned = image.getexif().get(ORIENTATION, 1) >= 5
+    return (height, width) if turned else (width, height)
 
 
 def read_text(path: str | os.PathLike[str], name: str, what: str = "a text file") -> str:

@@ -10,14 +10,14 @@ import torch
 from PIL import Image, ImageOps
 
 from geodiff_plugin._checks import bad_type, bad_value, warn
-from geodiff_plugin.formats.files import open_image
+from geodiff_plugin.formats.files import ORIENTATION, open_image
 
 #: Fewer pixels a side hold no matches; also the VAE's smallest sensible latent.
 MIN_SIDE = 32
 #: Resampling may overshoot [0, 1] by a little; more than this is another range.
 OVERSHOOT = 1e-3
-#: EXIF's tag, and its values for an image that is to be turned or mirrored.
-ORIENTATION, TURNS = 0x0112, range(2, 9)
+#: Values of the EXIF orientation of an image that is to be turned or mirrored.
+TURNS = range(2, 9)
 #: 16-bit values that all lie below this are those of a camera of 10 or 12 bits, as they come.
 DARK_16_BITS = 8192
 CHANNELS = (1, 3, 4)

@@ -11,11 +11,11 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin._checks import InputError, bad_value, check_number, warn
-from geodiff_plugin.formats.files import open_image
+from geodiff_plugin.formats.files import ORIENTATION, open_image
 from geodiff_plugin.formats.rigs import COEFFICIENT_COUNTS, intrinsics
 from geodiff_plugin.types import Distortion
 
-_ORIENTATION, _IFD, _FOCAL, _FOCAL_35, _ZOOM = 0x0112, 0x8769, 0x920A, 0xA405, 0xA404
+_IFD, _FOCAL, _FOCAL_35, _ZOOM = 0x8769, 0x920A, 0xA405, 0xA404
 _WIDTH, _HEIGHT, _X_RESOLUTION, _Y_RESOLUTION, _UNIT = 0xA002, 0xA003, 0xA20E, 0xA20F, 0xA210
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 #: Diagonal of a 35 mm frame, which equivalent focal lengths are compared by.
@@ -53,7 +53,7 @@ def intrinsics_from_exif(
         return _of(source, name)
     with open_image(source, name) as image:
         K, notes = _of(image, name)
-        turned = image.getexif().get(_ORIENTATION) in (5, 6, 7, 8)
+        turned = image.getexif().get(ORIENTATION, 1) >= 5
     return intrinsics(K[1, 1], K[0, 0], K[1, 2], K[0, 2]) if turned else K, notes
 
 

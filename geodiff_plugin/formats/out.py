@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Self, TypeVar
 
-from geodiff_plugin._checks import FolderError, InputFileError, MissingFileError, bad_value
+from geodiff_plugin._checks import InputFileError, MissingFileError, bad_value
 
 try:
     import fcntl
@@ -36,7 +36,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary path beside ``path``, renamed to it when the block ends well, else removed."""
     target = Path(path)
     if os.path.isdir(target):
-        raise FolderError(f"The output must be a file; got the folder {target}. Name a file inside of it.")
+        raise InputFileError(f"The output must be a file; got the folder {target}. Name a file inside of it.")
     if not os.path.isdir(target.parent):
         raise MissingFileError(
             f"The output must be in an existing folder; got {target}. Make the folder {target.parent} first."

@@ -20,72 +20,47 @@ _JSON = r"\A\s*[{\[]"
 #: Every format by name. The first that recognises a file reads it: formats that others contain come first.
 CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "middlebury": CalibrationFormat(
-        "Middlebury or ETH3D calib.txt (cam0=[...])", r"^\s*cam0\s*=\s*\[", stereo.read_middlebury
-    ),
+        "Middlebury or ETH3D calib.txt (cam0=[...])", r"^\s*cam0\s*=\s*\[", stereo.read_middlebury),
     "kitti_cam_to_cam": CalibrationFormat(
-        "KITTI (P_rect_02: ...)", r"^\s*P_rect_\d+\s*:", stereo.read_kitti, uses_cameras=True
-    ),
+        "KITTI (P_rect_02: ...)", r"^\s*P_rect_\d+\s*:", stereo.read_kitti, uses_cameras=True),
     # The number behind the colon keeps OpenCV's "P1: !!opencv-matrix" out.
     "kitti_projections": CalibrationFormat(
-        "KITTI (P0: ...)", r"^\s*P[0-3]\s*:\s*[-+.\d]", stereo.read_kitti, uses_cameras=True
-    ),
+        "KITTI (P0: ...)", r"^\s*P[0-3]\s*:\s*[-+.\d]", stereo.read_kitti, uses_cameras=True),
     "foundation_stereo": CalibrationFormat(
-        "K.txt of FoundationStereo (9 numbers, baseline)",
-        r"\A(?i:[-+.\de\s,]|nan|inf)+\Z",
-        stereo.read_foundation_stereo,
-    ),
+        "K.txt of FoundationStereo (9 numbers, baseline)", r"\A(?i:[-+.\de\s,]|nan|inf)+\Z",
+        stereo.read_foundation_stereo),
     "booster": CalibrationFormat(
-        "Booster xml (proj_matL)", r"<opencv_st[\s\S]*proj_matL", robots.read_booster
-    ),
+        "Booster xml (proj_matL)", r"<opencv_st[\s\S]*proj_matL", robots.read_booster),
     "mvsnet": CalibrationFormat(
-        "pair of MVSNet cam.txt (extrinsic)", r"^\s*extrinsic\s*$", stereo.read_mvsnet, (2,)
-    ),
+        "pair of MVSNet cam.txt (extrinsic)", r"^\s*extrinsic\s*$", stereo.read_mvsnet, (2,)),
     "zed": CalibrationFormat(
-        "ZED SN*.conf ([LEFT_CAM_HD])", r"^\s*\[(LEFT|RIGHT)_CAM_\w+\]", stereo.read_zed
-    ),
+        "ZED SN*.conf ([LEFT_CAM_HD])", r"^\s*\[(LEFT|RIGHT)_CAM_\w+\]", stereo.read_zed),
     "realsense": CalibrationFormat(
         "RealSense (rs-enumerate-devices -c, or rs2 as JSON)",
-        rf'{stereo.RS_PRINTED}|{_JSON}(?=[\s\S]*"ppx")',
-        stereo.read_realsense,
-    ),
+        rf'{stereo.RS_PRINTED}|{_JSON}(?=[\s\S]*"ppx")', stereo.read_realsense),
     "oak": CalibrationFormat(
-        "OAK-D JSON (cameraData)", _JSON + r'(?=[\s\S]*"cameraData")', stereo.read_oak, uses_cameras=True
-    ),
+        "OAK-D JSON (cameraData)", _JSON + r'(?=[\s\S]*"cameraData")', stereo.read_oak, uses_cameras=True),
     "nerf": CalibrationFormat(
         "transforms.json of nerfstudio or instant-ngp (frames, transform_matrix)",
-        _JSON + r'(?=[\s\S]*"frames")(?=[\s\S]*"transform_matrix")',
-        sfm.read_nerf,
-        by_image=True,
-    ),
+        _JSON + r'(?=[\s\S]*"frames")(?=[\s\S]*"transform_matrix")', sfm.read_nerf, by_image=True),
     "kalibr": CalibrationFormat(
-        "Kalibr camchain.yaml (cam0)", r"^cam\d+:\s*(?:#.*)?$", robots.read_kalibr, uses_cameras=True
-    ),
+        "Kalibr camchain.yaml (cam0)", r"^cam\d+:\s*(?:#.*)?$", robots.read_kalibr, uses_cameras=True),
     "euroc": CalibrationFormat("pair of EuRoC sensor.yaml (T_BS)", r"^T_BS\s*:", robots.read_euroc, (2,)),
     # Older settings describe the rectification too, and OpenCV's reader has these names.
     "orb_slam": CalibrationFormat(
         "ORB-SLAM's stereo settings (Camera1.fx, Camera.bf)",
-        r"\A(?![\s\S]*^LEFT\.P[ \t]*:)[\s\S]*^(?:Camera1?\.fx|Camera\.bf)[ \t]*:",
-        robots.read_orb_slam,
-    ),
+        r"\A(?![\s\S]*^LEFT\.P[ \t]*:)[\s\S]*^(?:Camera1?\.fx|Camera\.bf)[ \t]*:", robots.read_orb_slam),
     "opencv": CalibrationFormat(
         "OpenCV YAML, XML or JSON (P1, P2, or M1, M2, R, T)",
-        r'!!opencv-matrix|<opencv_storage|"opencv-matrix"',
-        robots.read_opencv,
-        (1, 2),
-    ),
+        r'!!opencv-matrix|<opencv_storage|"opencv-matrix"', robots.read_opencv, (1, 2)),
     "ros": CalibrationFormat(
         "pair of ROS camera_info (projection_matrix)",
-        r"^(projection_matrix|distortion_model|rectification_matrix)\s*:",
-        robots.read_ros,
-        (2,),
-    ),
+        r"^(projection_matrix|distortion_model|rectification_matrix)\s*:", robots.read_ros, (2,)),
     "stereodemo": CalibrationFormat(
-        "stereodemo JSON (fx)", _JSON + r'(?=[\s\S]*"fx")', stereo.read_stereodemo
-    ),
+        "stereodemo JSON (fx)", _JSON + r'(?=[\s\S]*"fx")', stereo.read_stereodemo),
     "colmap": CalibrationFormat(
-        "COLMAP model (cameras.txt and images.txt)", sfm.MARK, sfm.read_colmap, (2,), by_image=True
-    ),
-}
+        "COLMAP model (cameras.txt and images.txt)", sfm.MARK, sfm.read_colmap, (2,), by_image=True),
+}  # fmt: skip
 
 PathLike = str | os.PathLike[str]
 
@@ -172,7 +147,7 @@ def read_calibration(
         The rig: K in pixels of the images that the file is for, E in metres.
 
     Raises:
-        FileNotFoundError, IsADirectoryError, PermissionError: no readable file.
+        OSError: no readable file (FileNotFoundError: none at all).
         TypeError: not a path or a pair of paths.
         ValueError: empty, unknown format, cut off, lens distortion unless ``distorted``, cameras that are not
             there.

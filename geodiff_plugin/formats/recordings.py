@@ -23,6 +23,7 @@ from geodiff_plugin.formats.files import check_file
 #: Suffixes of videos, and of bags that can be written: one MCAP file of ROS 2, or a bag of ROS 1.
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 BAG_SUFFIXES = (".mcap", ".bag")
+FRAME_SIZE = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
 #: Encoding of a raw image -> type of its numbers, channels, and what makes RGB of it. OpenCV names Bayer
 #: patterns by the second row, ROS by the first.
 ENCODINGS: dict[str, tuple[str, int, int | None]] = {
@@ -51,15 +52,21 @@ def _open_video(path: Path, name: str) -> cv2.VideoCapture:
     return capture
 
 
-def count_frames(path: Path, name: str = "video") -> int:
-    """How many frames a video has, by going through it: heads of videos are not to be relied on."""
+def video_facts(path: Path, name: str = "video") -> tuple[int, float, tuple[int, int]]:
+    """How many frames a video has, by going through it, its frames a second, and ``(width, height)``."""
     capture, count = _open_video(path, name), 0
     while capture.grab():
         count += 1
+    fps, *size = (capture.get(fact) for fact in (cv2.CAP_PROP_FPS, *FRAME_SIZE))
     capture.release()
     if count == 0:
         bad_value(name, "a video with frames in it", f"{path}, which has none")
-    return count
+    return count, fps or 30.0, (int(size[0]), int(size[1]))
+
+
+def count_frames(path: Path, name: str = "video") -> int:
+    """How many frames a video has: heads of videos are not to be relied on."""
+    return video_facts(path, name)[0]
 
 
 class VideoReader(AbstractContextManager["VideoReader"]):
