@@ -220,10 +220,7 @@ def run_frames(
 
     ``capture`` has its poses solved and saved by ``solved_poses``; ``write`` is a function of a module, as
     other processes import it. Returns the reports in the order of the names; ``{"key", "status": "broken",
-    "error"}`` of a frame that failed.
-
-    Raises:
-        InputError: every frame failed for one reason.
+    "error"}`` of a frame that failed. ``InputError`` if every frame failed for one reason.
     """
     journal, items = Journal(options.out / JOURNAL), _items(capture, options, names)
     if options.overwrite:
@@ -290,9 +287,6 @@ def run_capture(options: CaptureOptions, write: Writer, say: Callable[[str], Non
     """Everything of ``geodiff capture``: poses, frames, and the report, as in ``capture.json``.
 
     ``write``, a function of a module, writes the files of a frame; ``say`` tells the user a sentence.
-
-    Raises:
-        OSError, InputError: bad input, before any depth is computed where it can be seen that early.
     """
     started = time.perf_counter()
     capture = open_capture(options)

@@ -105,9 +105,6 @@ def solve_capture(
         names: of the frames, for notes; their numbers by default.
         poses: ``"refined"``, or ``"given"`` to keep the given ones and find points by them.
         threads: of features, matching and adjustment.
-
-    Raises:
-        ValueError: pycolmap is missing; frames that cannot be connected at all, without given poses.
     """
     pycolmap()
     names = [str(number) for number in range(len(sizes))] if names is None else names

@@ -73,12 +73,7 @@ def _parallax_deg(tracks: Tracks, R: np.ndarray) -> np.ndarray:
 
 
 def estimate_pose(tracks: Tracks, name: str = "the two photographs") -> EstimatedPose:
-    """Rotation and direction of the baseline of one right view, of tracks with outliers.
-
-    Raises:
-        InputError: PoseLib is not installed; no pose is to be had: too few matches or inliers, a pure
-            rotation, too little parallax, two motions.
-    """
+    """Rotation and direction of the baseline of one right view, by tracks with outliers."""
     if len(tracks) < FEWEST_INLIERS:
         cure = (
             "Are they of the same place, sharp and well lit, none of them a mirror image (a selfie)? Half of "
@@ -117,14 +112,7 @@ def estimate_pose(tracks: Tracks, name: str = "the two photographs") -> Estimate
 
 
 def estimate_poses(views: GreyViews) -> tuple[Tracks, list[EstimatedPose]]:
-    """Poses of the right views of two photographs or more, matched anew.
-
-    Returns:
-        The inliers of all views, and the pose of each; the first baseline has length 1.
-
-    Raises:
-        InputError: as ``estimate_pose``; or views that share too few points with the first one.
-    """
+    """The inliers of the right views of two photographs or more, and their poses; the first baseline is 1."""
     tracks, poses = sparse_tracks(views), []
     for v in range(len(views.rights)):
         name = "the two photographs" if len(views.rights) == 1 else f"the left and right photograph {v + 1}"
@@ -290,14 +278,10 @@ def find_scale(
     known_length: tuple[float, float, float, float, float] | None,
     points: np.ndarray | None,
 ) -> Scale:
-    """Metres per unit, from whichever length is given.
+    """Metres per unit, from whichever length is given; arguments as ``from_photographs``.
 
     ``Ts (V, 4, 4)`` are ``T_right_from_left`` in units; ``factor`` is pixels of the tracks' grid a pixel of
-    the left photograph; ``baseline_m`` the distance of the first right camera; ``known_length``
-    ``(x1, y1, x2, y2, metres)`` in the left photograph; ``points`` ``(N, 3)`` metres in the left frame.
-
-    Raises:
-        InputError: baseline and length together, or ends of a length where nothing is matched.
+    the left photograph; ``points`` ``(N, 3)`` metres in the left frame.
     """
     given = [name for name, v in (("baseline", baseline_m), ("known length", known_length)) if v is not None]
     if len(given) > 1:

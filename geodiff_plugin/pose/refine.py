@@ -73,19 +73,12 @@ def refine_views(
     unit: str | None = "m",
     measured: bool = False,
 ) -> _Refined:
-    """Check the poses against the images, and refine them together where they do not fit.
+    """Check the poses against the images ``(3, H, W)`` in [0, 1], and refine them where they do not fit.
 
-    Args:
-        left_01: ``(3, H, W)`` float32 in [0, 1].
-        rights: as they were given, one or several.
-        K_left: ``(3, 3)`` pixels of ``left_01``.
-        unit: of the poses' lengths; those in metres are questioned where they seem to be in millimetres.
-        measured: whether the lengths of the baselines are measured. Refined poses then keep them, as those of
-            a rectified rig do; otherwise they are weighed against the scene's depth under the given poses.
-
-    Returns:
-        The right views, and the report. They are the very ones that were given where the poses fit, where
-        there are too few matches, where a mistake explains the misfit, or where no better pose is near.
+    Lengths in the ``unit`` metres are questioned where they seem to be in millimetres. ``measured`` baselines
+    keep their lengths, as those of a rectified rig do; others are weighed against the depth of the scene.
+    The right views are the very ones that were given where the poses fit, where there are too few matches,
+    where a mistake explains the misfit, or where no better pose is near.
     """
     views, given = grey_views(left_01, rights, K_left), _poses(rights)
     sparse = sparse_tracks(views)

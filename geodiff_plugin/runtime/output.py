@@ -155,12 +155,13 @@ def assemble_output(
     confidence, over_prior = None, _over_prior(run, depth_m)
     if support is not None:
         unseen = torch.zeros_like(depth_m)
-        seen = (unseen, unseen > 0) if visible is None else (error, visible)
+        seen = (unseen, unseen > 0) if error is None or visible is None else (error, visible)
         spread = None if uncertainty is None else uncertainty / depth_m
         confidence = depth_confidence(support, *seen, spread, prior_error)
     relative = torch.cat(run.relative)
     relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
-    told = {"doubts": tuple(s for s, forbids in warned.items() if forbids), "has_unit": has_unit}
+    doubts = tuple(sentence for sentence, forbids in warned.items() if forbids)
+    told: dict[str, Any] = {"doubts": doubts, "has_unit": has_unit}
     maps = relative, confidence, over_prior if has_unit else None
     verdicts = [judge(_indicators(run, i, K, depth_m[i], *maps, **told)) for i, K in enumerate(Ks)]
     if confidence is not None:
