@@ -170,15 +170,21 @@ def rectified() -> dict[str, object]:
 @part
 def cost_volume() -> dict[str, object]:
     both, one = volume(), volume(1)
-    near = build_cost_volume(scene()[0], scene()[3], scene()[2], depth_range=(2.0, 20.0))
+    near = build_cost_volume(scene()[0], scene()[3], scene()[2], depth_range=(0.6, 20.0))
     result: dict[str, object] = {}
     for name, made in (("both", both), ("one", one), ("given", near)):
         result |= {f"{name}_planes": made.inverse_depth, f"{name}_in_view": made.in_view}
         for k, share in enumerate((0.0, 0.35, 0.7, 1.0)):
             result[f"{name}_levels_{k}"] = made.levels[round(share * (len(made.levels) - 1))]
         result |= {f"{name}_grey": made.left_01, f"{name}_right_0": made.rights[0].image_01}
-        result[f"{name}_rectified"] = str(made.rectified)
+        result[f"{name}_kind"] = f"rectified {made.rectified}, {len(made.levels)} planes"
     return result
+
+
+def _fading(image: torch.Tensor) -> torch.Tensor:
+    """The image without texture in its right half."""
+    share = torch.sigmoid(12.0 - 22.0 * torch.linspace(0, 1, image.shape[-1]))
+    return 0.5 + share * (image - 0.5)
 
 
 @part
@@ -194,6 +200,9 @@ def matched() -> dict[str, object]:
             f"step_{count}": found.plane_step,
         }
     left, _, K, views = scene()
+    blank = [_fading(image) for image in (left, *(v.image_01 for v in views))]
+    rights = [v._replace(image_01=image) for v, image in zip(views, blank[1:], strict=True)]
+    result["blank_wall"] = match_volume(build_cost_volume(blank[0], rights, K)).confidence
     turned = [CameraView(v.image_01, v.K, torch.linalg.inv(v.T_right_from_left)) for v in views]
     asked = [mirrored_pose_preferred(left, given, K) for given in (views, turned)]
     return result | {"mirrored": str(asked)}
@@ -202,8 +211,7 @@ def matched() -> dict[str, object]:
 @part
 def searched() -> dict[str, object]:
     _, depth_m, _, _ = scene()
-    x, valid = _nearness(depth_m), torch.ones(1, 1, *SIZE, dtype=torch.bool)
-    valid[..., :20] = False
+    x, valid = _nearness(depth_m), _noise(1, 1, 37, 52, seed=5) > 0.8
     result: dict[str, object] = {}
     asked = {
         "free": {},
@@ -236,6 +244,7 @@ def fitted() -> dict[str, object]:
     for name, target in (("matches", reliable), ("points", points)):
         result[f"{name}_span"] = torch.stack(depth_span(target))
         result[f"{name}_basin"] = torch.stack(fit_to_points(x, target, metric))
+        result[f"{name}_bent"] = torch.stack(fit_to_points(x.sqrt(), target, metric))
         kept = torch.tensor([3.3]), torch.tensor([11.0])
         result[f"{name}_kept"] = torch.stack(fit_to_points(x, target, metric, kept))
     for name, target in (("matches", found), ("points", points)):
@@ -457,7 +466,7 @@ def tracks() -> tuple[Tracks, np.ndarray, np.ndarray]:
 def poses() -> dict[str, object]:
     given, Ts, w = tracks()
     cloud = given.rays / w[:, None]
-    length = (30.0, 20.0, 66.0, 44.0, 1.7)
+    length = (13.3, 10.3, 24.7, 16.3, 1.7)  # of a photograph a third as large, from the near plane to the far
     rng = np.random.default_rng(3)
     refined, before = w * np.exp(rng.normal(0, 0.02, w.shape)), 0.8 * w
     result: dict[str, object] = {"inverse_depth": solve_inverse_depth(given, Ts) / w}
@@ -466,17 +475,19 @@ def poses() -> dict[str, object]:
         ("length", (None, length, None)),
         ("points", (None, None, cloud)),
     ):
-        scale = find_scale(given, Ts, 1.3 if name == "length" else 1.0, *how)
+        scale = find_scale(given, Ts, 3.0, *how)
         result[name] = np.array([scale.factor, scale.spread or 0.0])
     for misfit in (0.0, 0.1):
         result[f"refined_{misfit}"] = np.array(refined_scale(refined, before, misfit))
     bent = replace(given.view(0), right_px=given.view(0).right_px + np.array([0.0, 1.5]))
     found = fit_displacement(bent, Ts[0], SIZES[0])
     assert found is not None
-    at_other_size = Displacement(found.coefficients, (144, 160), found.most_px, found.rms_px)
-    image = scene()[3][0].image_01
+    at_other_size = Displacement(found.coefficients, (108, 160), found.most_px, found.rms_px)
+    place = torch.stack(torch.meshgrid(*(torch.linspace(0, 1, n) for n in SIZES[0]), indexing="ij"))
     result |= {"displacement": found.at(bent.right_px[0]), "bend": np.array([found.most_px, found.rms_px])}
-    return result | {"straight": straightened(image, found), "other_size": straightened(image, at_other_size)}
+    for name, displacement in (("straight", found), ("other_size", at_other_size)):
+        result[name] = straightened(place, displacement) - place
+    return result
 
 
 @part
