@@ -10,7 +10,7 @@ import torch
 from diffusers import UNet2DModel
 from PIL import Image
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
+from geodiff_plugin import load_prior
 from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.terms import TERMS
 from geodiff_plugin.evaluation.baselines import METHODS, PriorCache, Settings, find_method
@@ -22,7 +22,7 @@ from geodiff_plugin.priors import PRIORS
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.scale.points import fit_to_points
 from geodiff_plugin.scale.space import SPACES, MetricMap
-from tests.conftest import make_vae
+from tests.conftest import guided_call, make_vae, quiet, seeded
 
 (PAGE,) = (Path(__file__).resolve().parents[1] / "docs").rglob("extending.md")
 #: Tables of the blocks that a reader takes alone, with all that they import.
@@ -73,25 +73,17 @@ def test_what_the_page_adds_works(page, textured_plane, tmp_path):
     tiny.save_pretrained(tmp_path)
     index = tmp_path / "model_index.json"
     index.write_text(index.read_text().replace('"diffusers",\n    "UNet2DModel"', '"mine",\n    "MyUNet"'))
-    pipe = enable_geometry_guidance(load_prior(tmp_path))
-    pipe.set_progress_bar_config(disable=True)
+    pipe = quiet(load_prior(tmp_path))
     assert isinstance(pipe, page["InkPipeline"])
-    guidance = GeometryGuidance(
-        textured_plane.right,
-        textured_plane.K,
-        textured_plane.E,
-        rule="sign",
-        weights={"photometric": 1.0, "far_pull": 0.1},
-        inner_steps=2,
-        min_steps=2,
-    )
-    out = pipe(Image.fromarray(textured_plane.left), guidance=guidance)
+    weights = {"photometric": 1.0, "far_pull": 0.1}
+    knobs = {"rule": "sign", "weights": weights, "inner_steps": 2, "min_steps": 2}
+    out = guided_call(pipe, textured_plane, knobs)
     assert (out.prediction > 0).all() and np.isfinite(out.prediction).all()
     assert "far_pull" in out.history[0].terms and len(out.history) == 2
 
 
 def test_a_space_is_known_to_map_fit_and_alignment(page):
-    x = torch.rand(1, 1, 24, 32, generator=torch.Generator().manual_seed(0)) * 0.9 + 0.05
+    x = torch.rand(1, 1, 24, 32, generator=seeded()) * 0.9 + 0.05
     metric, near, far = MetricMap("cube_root"), torch.tensor([1.5]), torch.tensor([9.0])
     depth_m = metric(x, metric.from_range(near, far))
     torch.testing.assert_close(metric.range_of(metric.from_range(near, far)), (near, far), rtol=2e-3, atol=0)

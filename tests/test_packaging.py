@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tomllib
 import zipfile
 from pathlib import Path
 
@@ -41,23 +40,11 @@ def test_type_checkers_see_the_public_names() -> None:
     assert sorted(geodiff_plugin.__all__) == sorted(imported)
 
 
-def test_constraints_pin_what_types_are_checked_with() -> None:
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
-        "optional-dependencies"
-    ]
-    pinned = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
-    for requirement in extras["dev"]:
-        name = requirement.split(">=")[0]
-        assert name == "geodiff-plugin[test]" or any(line.startswith(f"{name}==") for line in pinned)
-
-
 @pytest.fixture(scope="module")
 def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A wheel of this checkout, unpacked as an installer would."""
     folder = tmp_path_factory.mktemp("wheel")
-    source = (
-        folder / "source"
-    )  # a copy, since setuptools would take what an earlier build left in the checkout
+    source = folder / "source"  # setuptools would take what an earlier build left in the checkout
     shutil.copytree(ROOT / "geodiff_plugin", source / "geodiff_plugin")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
@@ -72,11 +59,8 @@ def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_wheel_holds_what_users_need_and_no_more(unpacked: Path) -> None:
     package = unpacked / "geodiff_plugin"
-    for name in (
-        "py.typed",
-        "bundled/prior/unet/diffusion_pytorch_model.safetensors",
-        "bundled/pair/left.png",
-    ):
+    weights = "bundled/prior/unet/diffusion_pytorch_model.safetensors"
+    for name in ("py.typed", weights, "bundled/pair/left.png"):
         assert (package / name).is_file()
     assert not (unpacked / "tests").exists()
 

@@ -281,8 +281,8 @@ def correction() -> dict[str, object]:
     depth_m, target = prior()
     left = scene()[0][None]
     error = prior_error(depth_m, target, left)
-    valid = torch.ones(1, 1, *SIZE)
-    valid[..., 50:70] = 0
+    valid = torch.ones(1, 1, 23, 31)
+    valid[..., 17:24] = 0
     result: dict[str, object] = {"error": error, "error_of_truth": prior_error(scene()[1], target, left)}
     rough = torch.nn.functional.interpolate(_noise(1, 1, 9, 13, seed=4), SIZE, mode="bicubic")
     result["error_rough"] = prior_error(depth_m * (0.1 * rough).exp(), target, left)
@@ -332,7 +332,8 @@ def losses() -> dict[str, object]:
     stacked = Matches.stack([evidence.matches]), Matches.stack([evidence.points])
     result: dict[str, object] = {}
     weights = dict.fromkeys(("photometric", "matches", "points", "prior_pull", "anchor"), 0.5)
-    for name, base in (("default", DEFAULT), ("paper", PAPER), ("dc", MARIGOLD_DC)):
+    unseen = replace(DEFAULT, min_visible=0.99)
+    for name, base in (("default", DEFAULT), ("paper", PAPER), ("dc", MARIGOLD_DC), ("unseen", unseen)):
         objective = Objective(chunk_views([evidence]), metric, replace(base, weights=weights))
         loss = objective(x, affine, start, z0, anchor, *stacked, hidden=objective.hidden(x, affine))
         result |= {f"{name}_{key}": value for key, value in loss.terms.items()} | {
