@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_number
+from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_number, check_positive
 from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.formats.out import atomic_path, reason_of
 
@@ -58,13 +58,11 @@ def depth_range(depth_m: Any, near: float | None = None, far: float | None = Non
     """The depths at the two ends of the colours, ``0 < near < far`` in metres; by default 2 % lie beyond.
 
     ``depth_m`` is ``(H, W)`` metres, numpy or torch; pixels that are not finite or not above 0 never count.
-
-    Raises:
-        ValueError: ``near`` or ``far`` not above 0 and finite, or ``near >= far`` when both are given.
+    ``ValueError`` for a given end that is not above 0 and finite, or ``near >= far``.
     """
     for name, value in (("near", near), ("far", far)):
-        if value is not None and not (0 < value < math.inf):
-            bad_value(name, "a depth in metres above 0", value)
+        if value is not None:
+            check_positive(value, name, "metres")
     if near is not None and far is not None and near >= far:
         bad_value("near, far", "near < far, in metres", f"{near}, {far}")
     depth_m = _as_map(depth_m)
@@ -85,18 +83,16 @@ def ticks(near: float, far: float, most: int = 8) -> list[float]:
 
     They are 1, 2, 5 (or denser) times powers of ten over wide ranges, equal steps over narrow ones.
     """
+    from matplotlib.ticker import MaxNLocator
+
     if far / near >= 4:
-        powers = range(math.floor(math.log10(near)), math.ceil(math.log10(far)) + 1)
+        powers = 10.0 ** np.arange(math.floor(math.log10(near)), math.ceil(math.log10(far)) + 1)
         for digits in ((1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7)):
-            inside = [d * 10.0**power for power in powers for d in digits if near <= d * 10.0**power <= far]
+            inside = [float(value) for value in np.outer(powers, digits).flat if near <= value <= far]
             if len(inside) >= 4:
                 return inside[:: math.ceil(len(inside) / most)]
-    magnitude = 10.0 ** math.floor(math.log10((far - near) / most))
-    for step in (magnitude * factor for factor in (1, 2, 5, 10)):
-        inside = [i * step for i in range(math.ceil(near / step - 1e-9), math.floor(far / step + 1e-9) + 1)]
-        if len(inside) <= most:
-            return [float(f"{value:.6g}") for value in inside]
-    return [near, far]
+    values = MaxNLocator(most - 1, steps=[1, 2, 5, 10]).tick_values(near, far)
+    return [float(f"{value:.6g}") for value in values if near <= value <= far]
 
 
 def _coloured(
@@ -182,8 +178,7 @@ def depth_figure(
 ) -> Image.Image:
     """A coloured depth map beside a colour bar, far on top; small maps are enlarged by a whole factor.
 
-    The map and the ends of the colours, and errors, are as for ``depth_range``; ``unit`` is ``"m"``, or
-    ``None`` for a depth without one, as the legend then says.
+    Arguments and errors are as for ``depth_range``; ``unit`` is ``"m"``, or ``None`` for a depth without one.
     """
     near, far = depth_range(depth_m, near, far)
     marks = [(math.log(z / near) / math.log(far / near), f"{z:g}") for z in ticks(near, far)]
@@ -217,10 +212,7 @@ def grid(
     """A contact sheet: pictures side by side, each under its title, scaled to ``cell_width`` pixels.
 
     Pictures are PIL images, or ``(H, W)`` or ``(H, W, 3)`` arrays of uint8, bool or floats in [0, 1]. A row,
-    of ``columns`` (all, up to 4), is as high as its highest.
-
-    Raises:
-        ValueError: no pictures, another number of titles, an array that is no picture.
+    of ``columns`` (all, up to 4), is as high as its highest. ``ValueError`` for none, or other titles.
     """
     pictures = [_as_picture(image) for image in images]
     if not pictures or len(titles) != len(pictures):
@@ -250,26 +242,21 @@ def overview(
     error: np.ndarray | None,
     unit: str | None = "m",
 ) -> Image.Image:
-    """Left image in [0, 1], depth with legend, and any confidence and photometric error, two in a row.
-
-    Both are ``(H, W)`` in [0, 1], the latter not finite where no right view sees the pixel.
-    """
+    """Left image in [0, 1], depth, any confidence and photometric error (not finite if unseen), 2 a row."""
     every = max(1, depth_m.shape[1] // (2 * CELL_WIDTH))
     depth = depth_figure(depth_m[::every, ::every], unit=unit)
     left = _as_picture(left_01[::every, ::every].astype(np.float32))
     beside = Image.new("RGB", depth.size, "white")  # as wide as a map with its bar: all have one scale
     beside.paste(left.resize((round(left.width * depth.height / left.height), depth.height)), (0, 0))
-    cells, titles = [beside, depth], ["left image", "depth"]
+    cells = {"left image": beside, "depth": depth}
     if confidence is not None:
-        cells.append(share_figure(confidence[::every, ::every], "within 10 %", 1.0))
-        titles.append("confidence")
+        cells["confidence"] = share_figure(confidence[::every, ::every], "within 10 %", 1.0)
     if error is not None:
         error = error[::every, ::every]
         finite = error[np.isfinite(error)]
         top = max(LEAST_ERROR, float(np.quantile(finite, 0.98))) if finite.size else LEAST_ERROR
-        cells.append(share_figure(error, "difference", top))
-        titles.append("photometric error (grey: not seen from the right)")
-    return grid(cells, titles, columns=2, cell_width=CELL_WIDTH)
+        cells["photometric error (grey: not seen from the right)"] = share_figure(error, "difference", top)
+    return grid(list(cells.values()), list(cells), columns=2, cell_width=CELL_WIDTH)
 
 
 def depth_frames(
@@ -280,11 +267,8 @@ def depth_frames(
 ) -> Iterator[Image.Image]:
     """One picture a depth map, all of one size and in the same colours; each is drawn when it is asked for.
 
-    The maps are ``(H, W)`` metres (or of no ``unit``). ``near`` and ``far`` are as in ``depth_range``, over
-    all maps.
-
-    Raises:
-        ValueError: no maps, or maps of several shapes.
+    The maps are ``(H, W)`` metres (or of no ``unit``); ``near`` and ``far`` are as in ``depth_range``, over
+    all maps. ``ValueError`` for no maps, or maps of several shapes.
     """
     shapes, samples = set(), []
     for depth_m in depths_m:  # one pass: a map may be read from its file whenever it is asked for
@@ -306,27 +290,23 @@ def check_video(path: str | os.PathLike[str], fps: float) -> None:
 
 def _write_mp4(path: Path, frames: Iterable[Image.Image], fps: float) -> None:
     """Frame by frame; H.264 and its like want even sides."""
-    writer = None
+    writer = cv2.VideoWriter()
     try:
         for frame in frames:
             width, height = size = tuple(side // 2 * 2 for side in frame.size)
-            writer = writer or cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
-            if not writer.isOpened():
+            opened = writer.isOpened() or writer.open(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+            if not opened:
                 raise InputFileError("the video must be one that OpenCV can write; got .mp4.")
             writer.write(np.ascontiguousarray(np.asarray(frame.convert("RGB"))[:height, :width, ::-1]))
     finally:  # an open file can be neither renamed nor removed on Windows
-        if writer is not None:
-            writer.release()
+        writer.release()
 
 
 def write_depth_video(path: str | os.PathLike[str], frames: Iterable[Image.Image], fps: float = 10.0) -> None:
     """Write frames, all of one size, as .mp4 (by OpenCV), .webp or .gif; whole or not at all.
 
     An MP4 is written frame by frame; all frames of the others are in memory, as Pillow wants them.
-
-    Raises:
-        ValueError: another ending, no frames, or ``fps`` (frames a second) outside [0.1, 120].
-        OSError: the file cannot be written.
+    ``ValueError`` as ``check_video``, and for no frames; ``OSError`` if the file cannot be written.
     """
     check_video(path, fps)
     rest, kind = iter(frames), Path(path).suffix.lower()

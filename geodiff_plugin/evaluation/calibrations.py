@@ -59,21 +59,17 @@ def poses_table(title: str, columns: Mapping[str, Sequence[Record]], note: str) 
     return Table(title, ("pair", *columns), tuple(rows), note)
 
 
-def _residual_table(records: Sequence[Record]) -> Table:
-    """Residuals of the matches as given and as used, a row a pair."""
-    rows = []
-    for record in records:
-        notes = record.get("notes", {}).get("method", {})
-        residuals = (notes.get(name) or [] for name in ("residual_px_given", "residual_px"))
-        rows.append(
-            (label_of(record), *(" / ".join(f"{px:.2f}" for px in each) or "-" for each in residuals))
-        )
-    note = "Median distance of the matches from their epipolar lines, pixels; one number a right view."
-    return Table("Residuals", ("pair", "refined, as given", "refined, as used"), tuple(rows), note)
+def _residual(name: str, own: Sequence[Record]) -> str:
+    """One number a right view, a dash for none."""
+    return " / ".join(f"{px:.2f}" for px in tables.value_at(own[0], f"notes.method.{name}") or []) or "-"
 
 
-def _every_pose(refs: Sequence[SampleRef]) -> Columns:
-    return {"refined": (refs, "refine"), "given": (refs, "given"), "estimated": (refs, "estimated")}
+_RESIDUALS: dict[str, CellOf] = {
+    "pair": lambda own: label_of(own[0]),
+    "refined, as given": partial(_residual, "residual_px_given"),
+    "refined, as used": partial(_residual, "residual_px"),
+}
+RESIDUAL_NOTE = "Median distance of the matches from their epipolar lines, pixels; one number a right view."
 
 
 def run_poses(name: str, options: PosesOptions) -> Page | None:
@@ -100,8 +96,9 @@ def run_poses(name: str, options: PosesOptions) -> Page | None:
     drifted = [changed_ref(ref, "drifted", drift) for ref in rectified]
     perturbed = [changed_ref(ref, "perturbed", change) for ref in rendered]
     withheld = "'estimated' has the poses withheld but for the length of the first baseline."
-    add("real ", "two views", withheld, _every_pose(real))
-    add("real ", "three views", "", _every_pose(several), views=3)
+    poses = {"refined": "refine", "given": "given", "estimated": "estimated"}
+    add("real ", "two views", withheld, {column: (real, pose) for column, pose in poses.items()})
+    add("real ", "three views", "", {column: (several, pose) for column, pose in poses.items()}, views=3)
     turned = f"The right camera has turned by {drift[0]:g} degrees and its image has moved by {drift[1]:g} px"
     of_drifted = {"true, given": (rectified, "given"), "drifted, given": (drifted, "given")}
     of_drifted |= {"drifted, refined": (drifted, "refine")}
@@ -116,7 +113,9 @@ def run_poses(name: str, options: PosesOptions) -> Page | None:
         for title, own in tables.grouped(records, "table").items():
             columns = tables.grouped(own, "column")
             shown.append(poses_table(title, columns, notes[title]))
-            shown += [_residual_table(columns["refined"])] if title.endswith("two views") else []
+            if title.endswith("two views"):
+                of_pairs = (columns["refined"], ("key",), _RESIDUALS, RESIDUAL_NOTE)
+                shown.append(tables.table_of_groups("Residuals", *of_pairs))
         return shown
 
     said = f"Prior {options.prior}, seed {options.seed}. All pixels with truth, metres as they come out."

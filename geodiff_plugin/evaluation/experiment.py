@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import date
 from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +45,7 @@ Tables = Callable[[list[Record]], Sequence[Table]]
 def run_facts(command: str, options: Any) -> dict[str, Any]:
     """Command line, date, versions and machine of a run."""
     machine = f"{platform.machine()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads"
-    if torch.cuda.is_available():
-        machine += f", {torch.cuda.get_device_name()}"
+    machine += f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
     line = {"command": command_line(command, options), "date": date.today().isoformat()}
     return line | {"versions": versions() | {"opencv": cv2.__version__}, "machine": machine}
 
@@ -156,16 +156,14 @@ def _measure(
     except NotApplicable as reason:
         return {"rectified": sample.rectified, "status": "not applicable", "reason": str(reason)} | process
     seconds = time.perf_counter() - start + priors.evidence.take_spared_seconds()
-    head = {"rectified": sample.rectified, "status": "ok", "seconds": round(seconds, 3)}
-    head["peak_bytes"] = memory.peak_bytes
+    cost = {"seconds": round(seconds, 3), "peak_bytes": memory.peak_bytes}
     scores = score(cropped(sample, crop), prediction, DATASETS[sample.dataset].cap_m)
     notes = {"notes": {"sample": dict(sample.notes), "method": dict(prediction.notes)}}
-    saved = {}
     if path is not None and prediction.depth_m is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_depth_npy(path, prediction.depth_m)
-        saved = {"map": file_digest(path)}
-    return head | scores | notes | saved | process
+        notes["map"] = file_digest(path)
+    return {"rectified": sample.rectified, "status": "ok"} | cost | scores | notes | process
 
 
 def _has_map(cell: Item, record: Record) -> bool:
@@ -187,28 +185,24 @@ def method_cells(
 ) -> list[Item]:
     """A cell for every method on every sample, all of ``RECORDS_NAME``.
 
-    With ``save_depth`` each metric depth map goes to ``out/depth/<method>/<dataset>_<sample>.npy``, where the
-    method ``files:out/depth/<method>`` finds it; a record without its map is made again. Records have
-    ``status`` ``"ok"``, ``"not applicable"`` (``reason``) or ``"broken"`` (``error``), and the numbers of
-    ``scoring.score``.
+    With ``save_depth`` metres go to ``out/depth/<method>/<dataset>_<sample>.npy``; a record without its map
+    is made again. Its ``status`` is ``"ok"``, ``"not applicable"`` (``reason``) or ``"broken"`` (``error``).
     """
     # One sample, read once, serves all its methods.
     process, priors, read = this_process(), PriorCache(), lru_cache(maxsize=1)(load)
-    several = process.count > 1
+    several, cropping = process.count > 1, {} if crop == "none" else {"crop": crop}
     if several and settings.device == "cuda":
         settings = replace(settings, device=f"cuda:{process.local % torch.cuda.device_count()}")
     cells = []
-    for ref in refs:
-        for method in map(find_method, methods):
-            chosen = method.own_settings(settings)
-            prior = f"{chosen.prior} {priors.fingerprint(chosen)}" if method.uses_prior else ""
-            device = chosen.device.partition(":")[0] if several else chosen.device
-            cropping = {} if crop == "none" else {"crop": crop}
-            configuration = method.configuration(replace(chosen, device=device)) | cropping
-            folder = out / "depth" / re.sub(r"[^\w.=+-]+", "_", method.name)
-            path = folder / f"{map_name(ref.dataset, ref.name)}.npy" if save_depth else None
-            work = partial(_measure, ref, read, method, chosen, priors, crop, path=path)
-            head = {"dataset": ref.dataset, "sample": ref.name, "method": method.name}
-            key, name = cell_key(ref, method.base_name, configuration, prior), f"{ref.label}, {method.name}"
-            cells.append(Item(key, work, name=name, words=(method.name,), head=head))
+    for ref, method in product(refs, map(find_method, methods)):
+        chosen = method.own_settings(settings)
+        prior = f"{chosen.prior} {priors.fingerprint(chosen)}" if method.uses_prior else ""
+        device = chosen.device.partition(":")[0] if several else chosen.device
+        configuration = method.configuration(replace(chosen, device=device)) | cropping
+        folder = out / "depth" / re.sub(r"[^\w.=+-]+", "_", method.name)
+        path = folder / f"{map_name(ref.dataset, ref.name)}.npy" if save_depth else None
+        work = partial(_measure, ref, read, method, chosen, priors, crop, path=path)
+        head = {"dataset": ref.dataset, "sample": ref.name, "method": method.name}
+        key, name = cell_key(ref, method.base_name, configuration, prior), f"{ref.label}, {method.name}"
+        cells.append(Item(key, work, name=name, words=(method.name,), head=head))
     return cells

@@ -209,12 +209,11 @@ def sweep_g_s(
     cameras = [torch.as_tensor(matrix, dtype=torch.float32)[None] for matrix in matrices]
     x = smooth_floor(torch.from_numpy(np.asarray(relative, np.float32))[None, None])
     candidates = torch.from_numpy(np.geomspace(1.0, largest_m, CANDIDATES).astype(np.float32))
-    scale, shift = torch.ones(1), torch.zeros(1)
     if not SPACES[space].grows_with_depth:
-        scale = shift = F.softplus(torch.zeros(1))
+        x = F.softplus(torch.zeros(1)) * x + F.softplus(torch.zeros(1))
 
     def at(g_s: torch.Tensor) -> tuple[torch.Tensor, Any]:
-        depth_m = SPACES[space].forward(scale * x + shift, g_s)
+        depth_m = SPACES[space].forward(x, g_s)
         return depth_m, warp_right_to_left(right, depth_m, *cameras)
 
     rows = []

@@ -6,7 +6,6 @@ Paper: S5.3, which the changes of a preset extend, and S9 for the cost.
 from __future__ import annotations
 
 import statistics
-from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -56,13 +55,11 @@ def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
     remarks = [f"Prior {options.prior}, seed {options.seed}, ensemble {options.ensemble}."]
     if options.crop != "none":
         remarks.append(f"Only what lies in the crop {options.crop!r} is scored.")
-    reasons = Counter(
-        (find_method(record["method"]).title, record["reason"])
-        for record in records
-        if record["status"] == "not applicable"
-    )
-    remarks += [f"{title}: '-' for {count_of_pairs(n)}, {reason}." for (title, reason), n in reasons.items()]
-    broken = [record for record in records if record["status"] == "broken"]
+    by_status = tables.grouped(records, "status")
+    impossible = tables.grouped(by_status.get("not applicable", ()), "method", "reason")
+    for (method, reason), own in impossible.items():
+        remarks.append(f"{find_method(method).title}: '-' for {count_of_pairs(len(own))}, {reason}.")
+    broken = by_status.get("broken", ())
     if broken:
         count = len(set(map(tables.label_of, broken)))
         remarks.append(f"{count} broken {'sample was' if count == 1 else 'samples were'} skipped:")
@@ -208,8 +205,7 @@ STEPS = 4
 def cost_table(records: Sequence[Record]) -> Table:
     """Seconds and memory of every method, and both as multiples of the plain pipeline's."""
     costs, rows = {}, []
-    done = [record for record in records if record["status"] == "ok"]
-    for method, own in tables.grouped(done, "method").items():
+    for method, own in tables.grouped((r for r in records if r["status"] == "ok"), "method").items():
         peak = max(record["peak_bytes"] for record in own)
         costs[method] = len(own), statistics.median(record["seconds"] for record in own), peak
     if PLAIN not in costs:

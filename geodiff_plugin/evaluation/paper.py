@@ -45,11 +45,6 @@ class Column(NamedTuple):
         other = "" if self.dataset == self.datasets[0] else f"{self.dataset}, "
         return f"{self.title} ({other}{count_of_pairs(len(self.labels))})"
 
-    @property
-    def obtain(self) -> str:
-        """Where the set comes from."""
-        return DATASETS[self.datasets[0]].obtain
-
 
 class PaperRow(NamedTuple):
     """One row of a table, predictions ``aligned`` with the truth or not; ``published`` by the column's title.
@@ -184,11 +179,9 @@ def layout_table(
 
 def methods_of(name: str, added: Sequence[str]) -> tuple[str, ...]:
     """Every method that a table runs: the paper's rows, others beside them, and what the user adds."""
-    layout = LAYOUTS[name]
+    layout, changed = LAYOUTS[name], ABLATED if name == "ablation" else ()
     names = [*(row.method for row in layout.rows if not row.outside), *layout.methods, *added]
-    if name == "ablation":
-        names += [method for preset in ABLATED for _, method in CHANGES[preset]]
-    return tuple(dict.fromkeys(names))
+    return tuple(dict.fromkeys([*names, *(method for preset in changed for _, method in CHANGES[preset])]))
 
 
 def _find(column: Column, options: PairsOptions, draw: bool) -> tuple[Column, list[SampleRef]]:
@@ -217,7 +210,7 @@ def run_paper_table(name: str, options: PairsOptions) -> Page | None:
     """Measure what one table of the paper needs, and write it; ``options.methods`` are run beside its own."""
     layout, posed, ablation = LAYOUTS[name], name == "table3", name == "ablation"
     if options.data is None and not ablation:
-        obtain = " ".join(f"{column.title}: {column.obtain}" for column in layout.columns)
+        obtain = " ".join(f"{c.title}: {DATASETS[c.datasets[0]].obtain}" for c in layout.columns)
         bad_value("--data", "given", "nothing", obtain)
     if posed:
         options = replace(options, pairs="all")
@@ -225,7 +218,8 @@ def run_paper_table(name: str, options: PairsOptions) -> Page | None:
     # The paper drew its posed pairs at random, and so does the table where there are enough to draw from.
     chosen = [_find(column, options, draw=posed) for column in columns]
     refs = [ref for _, own in chosen for ref in own]
-    more = [f"{c.title} was not found. To obtain it: {c.obtain}" for c, own in chosen if not own]
+    missing = ((c.title, DATASETS[c.datasets[0]].obtain) for c, own in chosen if not own)
+    more = [f"{title} was not found. To obtain it: {obtain}" for title, obtain in missing]
     if not refs:
         bad_value("--data", f"a folder with the data of {name}", str(options.data), " ".join(more))
     if posed:

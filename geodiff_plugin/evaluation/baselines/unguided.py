@@ -48,8 +48,7 @@ def sweep(sample: StereoSample, device: str, views: int = 2) -> CostVolume:
 
 #: Largest shift that is tried, as a share of the image width.
 MAX_SHIFT = 0.25
-#: Matches with a smaller shift than this, in pixels, are taken for mistakes and filled: one such match in the
-#: sky's neighbourhood costs more AbsRel than a hundred good ones gain.
+#: Matches with a smaller shift than this, in pixels, are taken for mistakes, which cost most, and filled.
 MIN_SHIFT_PX = 1.0
 #: As OpenCV's example sets its filter.
 WLS_LAMBDA, WLS_SIGMA = 8000.0, 1.5
@@ -165,10 +164,10 @@ def _read(path: Path, kind: str) -> np.ndarray:
 
 def _prediction(values: np.ndarray, sample: StereoSample, kind: str) -> Prediction:
     """A map at the image's size; bilinear, so that a hole grows by the pixels that it mixes into."""
-    size, resized = sample.left.shape[:2], values
-    if values.shape != tuple(size):
+    size, resized = tuple(sample.left.shape[:2]), values
+    if values.shape != size:
         given = torch.from_numpy(values)[None, None]
-        resized = F.interpolate(given, tuple(size), mode="bilinear", align_corners=False)[0, 0].numpy()
+        resized = F.interpolate(given, size, mode="bilinear", align_corners=False)[0, 0].numpy()
     if kind.startswith("relative"):
         return Prediction(None, relative=resized, space=kind.removeprefix("relative-"))
     if kind == "depth":
@@ -210,10 +209,10 @@ def files_method(text: str, guided: bool = False) -> Method:
         maps = {"kind": kind, "files": folder_fingerprint(folder)}
         return maps | (guided_configuration(GeometryGuidance, settings) if guided else {})
 
-    name, title = f"{'prior-map' if guided else 'files'}:{text}", folder.resolve().name
-    summary = f"maps of {title} ({KINDS[kind]})" + (", guided" if guided else "")
-    title = f"guided {title}" if guided else title
-    return Method(name, title, summary, run, configuration, uses_prior=False)
+    name, title = folder.resolve().name, f"maps of {folder.resolve().name} ({KINDS[kind]})"
+    if guided:
+        return Method(f"prior-map:{text}", f"guided {name}", f"{title}, guided", run, configuration, False)
+    return Method(f"files:{text}", name, title, run, configuration, uses_prior=False)
 
 
 def prior_map_method(text: str) -> Method:
