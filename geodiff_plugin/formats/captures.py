@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,17 +30,16 @@ IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 #: Factory intrinsics that the data sets publish for files without their own.
 SEVEN_SCENES = Camera(intrinsics(525.0, 525.0, 320.0, 240.0), (640, 480))
 TUM_RGBD = Camera(intrinsics(525.0, 525.0, 319.5, 239.5), (640, 480))
-#: What data sets with a pose a file call their images, poses, depth maps and intrinsics.
+#: What data sets with a pose a file call their images, poses and depth maps, and their intrinsics.
 TRACKED = {
-    "7-Scenes": (
-        *("frame-*.color.*", "{}.pose.txt", "{}.depth.png"),
-        *(("intrinsics.txt", "camera-intrinsics.txt", "intrinsic_color.txt"), SEVEN_SCENES),
-    ),
-    "ScanNet": (
-        *("color/*", "pose/{}.txt", "depth/{}.png"),
-        *(("intrinsic/intrinsic_color.txt", "intrinsic_color.txt"), None),
-    ),
+    "7-Scenes": ("frame-*.color.*", "{}.pose.txt", "{}.depth.png", SEVEN_SCENES),
+    "ScanNet": ("color/*", "pose/{}.txt", "depth/{}.png", None),
 }
+#: Files of intrinsics in the folder of such a data set, or above it.
+INTRINSICS = (
+    *("intrinsics.txt", "camera-intrinsics.txt", "K.txt"),
+    *("intrinsic/intrinsic_color.txt", "intrinsic_color.txt"),
+)
 #: Values a metre of TUM's depth maps; all others are in millimetres.
 TUM_DEPTH = 5000.0
 #: Entries of a frame by which a transforms.json says that its poses come from structure from motion.
@@ -100,29 +99,23 @@ def read_capture(
     if files is None:
         expected = "a COLMAP model, a transforms.json, 7-Scenes, ScanNet or TUM RGB-D, a video or images"
         bad_value("PATH", expected, f"{source}, which is none of these")
+    tracked = any(frame.E is not None for frame in files.frames)
     frames = [frame for frame in files.frames if frame.image.is_file()]
-    notes = _skipped([frame.name for frame in files.frames if not frame.image.is_file()], "no image file", "")
+    skipped = {"no image file": [frame.name for frame in files.frames if frame not in frames]}
+    if tracked:
+        skipped["no pose"] = [frame.name for frame in frames if frame.E is None]
+        frames = [frame for frame in frames if frame.E is not None]
+    notes = tuple(
+        f"{', '.join(names[:5])}{', ...' * (len(names) > 5)}: {why}; {len(names)} skipped."
+        for why, names in skipped.items()
+        if names
+    )
     if len({frame.name for frame in frames}) < len(frames):  # of two folders, whose names tell them apart
         frames = [replace(frame, name=f"{frame.image.parent.name}-{frame.name}") for frame in frames]
     if len(frames) < 2:
         cure = "One frame has no second view: use geodiff depth with known points, or record more."
         bad_value("a capture", "at least two frames", f"{len(frames)} in {source}", cure)
-    return replace(files, frames=tuple(frames), notes=files.notes + notes)
-
-
-def _skipped(names: Sequence[str], why: str, cure: str) -> tuple[str, ...]:
-    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return (f"{', '.join(names[:5])}{more}: {why}; skipped. {cure}".strip(),) if names else ()
-
-
-def _posed(frames: Sequence[CaptureFrame], kind: str) -> CaptureFiles:
-    """The frames that have a pose, and a sentence on the others; all of them where none has."""
-    posed = tuple(frame for frame in frames if frame.E is not None)
-    if not posed:
-        return CaptureFiles(tuple(frames), kind, None)
-    lost = [frame.name for frame in frames if frame.E is None]
-    cure = "Delete the others' poses as well to have all of them estimated."
-    return CaptureFiles(posed, kind, notes=_skipped(lost, "no pose", cure))
+    return CaptureFiles(tuple(frames), files.kind, files.unit if tracked else None, notes)
 
 
 def _typed_K(typed: Typed, size: tuple[int, int]) -> np.ndarray | None:
@@ -144,14 +137,14 @@ def _framed(
     return CaptureFrame(path.stem, path, K, size, E, lens_of(camera, f"{path}"), depth)
 
 
-def _file_camera(folder: Path, names: Sequence[str], published: Camera | None) -> Camera:
-    """Intrinsics of the first of some files in the folder or above it, else the data set's published ones."""
-    files = [parent / name for parent in (folder, folder.parent) for name in names]
+def _file_camera(folder: Path, published: Camera | None) -> Camera:
+    """The intrinsics that a data set has as a file, else its published ones."""
+    files = [parent / name for parent in (folder, folder.parent) for name in INTRINSICS]
     file = next((file for file in files if file.is_file()), None)
     if file is not None:
         return Camera(read_matrix(file, f"{file}")[:3, :3])
     if published is None:
-        bad_value("K", "given by --K, --fov or a file", f"none of {', '.join(names)} in {folder}")
+        bad_value("K", "given by --K, --fov or a file", f"none of {', '.join(INTRINSICS)} in {folder}")
     return published
 
 
@@ -213,23 +206,23 @@ def _colmap(path: Path, typed: Typed) -> CaptureFiles | None:
 
 
 def _tracked(folder: Path, typed: Typed) -> CaptureFiles | None:
-    for kind, (images, pose, depth, names, published) in TRACKED.items():
+    for kind, (images, pose, depth, published) in TRACKED.items():
         paths = sorted((p for p in folder.glob(images) if p.suffix.lower() in IMAGES), key=_natural)
         if not (paths and (folder / pose).parent.is_dir()):
             continue
-        camera, frames = _file_camera(folder, names, published), []
+        camera, frames = _file_camera(folder, published), []
         for path in paths:
             name = path.name.partition(".")[0]
             E = _matrix_pose(folder / pose.format(name))
             frames.append(replace(_framed(path, camera, E, typed, folder / depth.format(name)), name=name))
-        return _posed(frames, kind)
+        return CaptureFiles(tuple(frames), kind)
     return None
 
 
 def _tum(folder: Path, typed: Typed) -> CaptureFiles | None:
     if not ((folder / "rgb.txt").is_file() and (folder / "groundtruth.txt").is_file()):
         return None
-    camera = _file_camera(folder, ("intrinsics.txt", "K.txt"), TUM_RGBD)
+    camera = _file_camera(folder, TUM_RGBD)
     pose_at = _trajectory(folder / "groundtruth.txt")
     depths = _timed_names(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
     frames = []
@@ -238,7 +231,7 @@ def _tum(folder: Path, typed: Typed) -> CaptureFiles | None:
         depth = folder / depth_name if abs(near - t) < FARTHEST_S else None
         frame = _framed(folder / name, camera, pose_at(t), typed, depth)
         frames.append(replace(frame, depth_per_m=TUM_DEPTH))
-    return _posed(frames, "TUM RGB-D")
+    return CaptureFiles(tuple(frames), "TUM RGB-D")
 
 
 def _timed_names(file: Path) -> list[tuple[float, str]]:
@@ -275,7 +268,7 @@ def _video(path: Path, typed: Typed) -> CaptureFiles | None:
         bad_value("K", "given by --K or --fov", "none", "A video does not say its focal length.")
     pose_at = _trajectory(Path(typed[1])) if typed[1] is not None else lambda t: None
     frames = [CaptureFrame(f"{n:06d}", path, K, size, pose_at(n / fps), index=n) for n in range(count)]
-    return _posed(frames, "video")
+    return CaptureFiles(tuple(frames), "video")
 
 
 def _images(path: Path, typed: Typed) -> CaptureFiles | None:
@@ -286,7 +279,7 @@ def _images(path: Path, typed: Typed) -> CaptureFiles | None:
         K = _typed_K(typed, size)
         K = intrinsics_from_exif(image, image.name)[0] if K is None else K
         frames.append(CaptureFrame(image.stem, image, K, size))
-    return CaptureFiles(tuple(frames), "images without poses", None) if frames else None
+    return CaptureFiles(tuple(frames), "images without poses") if frames else None
 
 
 LAYOUTS = (_transforms, _colmap, _tracked, _tum, _video, _images)

@@ -18,7 +18,6 @@ from geodiff_plugin._camera_checks import check_intrinsics, check_metres
 from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.formats.files import check_file, open_image, read_npy, read_rows, read_text
 from geodiff_plugin.formats.out import atomic_path
-from geodiff_plugin.formats.stereo import KITTI_ROW
 
 if TYPE_CHECKING:  # which imports torch
     from geodiff_plugin.types import Rig
@@ -47,6 +46,8 @@ PLY_HEAD = re.compile(
     rf"ply\s+format ({'|'.join(PLY_ORDERS)}) \S+\s+element vertex (\d{{1,12}})\s+"
     rf"((?:property (?:{'|'.join(PLY_TYPES)}) \w+\s+)+)(?:element|end_header)"
 )
+#: A row of KITTI's calibrations, which readers of cameras use too.
+KITTI_ROW = re.compile(r"^\s*(\w+)\s*:(.*)$", re.MULTILINE)
 #: A head is text; none is near this size.
 LONGEST_HEAD = 65_536
 VELODYNE = "KITTI's calib/N.txt, or calib_velo_to_cam.txt together with calib_cam_to_cam.txt"

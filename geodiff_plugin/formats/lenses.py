@@ -53,8 +53,9 @@ def intrinsics_from_exif(
         return _of(source, name)
     with open_image(source, name) as image:
         K, notes = _of(image, name)
-        turned = image.getexif().get(ORIENTATION, 1) >= 5
-    return intrinsics(K[1, 1], K[0, 0], K[1, 2], K[0, 2]) if turned else K, notes
+        if image.getexif().get(ORIENTATION, 1) >= 5:
+            K = intrinsics(K[1, 1], K[0, 0], K[1, 2], K[0, 2])
+    return K, notes
 
 
 def warn_of_other_lens(source: str | os.PathLike[str] | Image.Image, K: np.ndarray, name: str) -> None:

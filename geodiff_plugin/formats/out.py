@@ -71,16 +71,16 @@ def _hidden(target: Path) -> Path:
     return target / PARTIAL if target.is_dir() else _beside(target)
 
 
-def check_out(path: Path, name: str = "--out") -> Path:
-    """The place that an output folder has or will have, links followed; messages call it ``name``."""
+def check_out(path: Path) -> Path:
+    """The place that an output folder has or will have, links followed."""
     try:
         target = path.resolve()
         with suppress(FileNotFoundError):
             os.stat(_beside(target))  # the longest name that will be needed
     except OSError as error:
-        bad_value(name, "a folder that can be made", f"{path} ({reason_of(error)})", "Name another.")
+        bad_value("--out", "a folder that can be made", f"{path} ({reason_of(error)})", "Name another.")
     if target.exists() and not target.is_dir():
-        bad_value(name, "a folder", f"the file {path}", "Name a folder.")
+        bad_value("--out", "a folder", f"the file {path}", "Name a folder.")
     return target
 
 
@@ -108,9 +108,8 @@ def _take(hidden: Path, stack: ExitStack) -> bool:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
-    return (
-        os.fstat(file.fileno()).st_nlink > 0
-    )  # a run that ended meanwhile has removed the file: nobody's lock
+    # A run that ended meanwhile has removed the file: nobody's lock.
+    return os.fstat(file.fileno()).st_nlink > 0
 
 
 def _held(hidden: Path) -> bool:
@@ -135,21 +134,19 @@ class OutFolder:
     ``overwrite`` it may hold files: an earlier run's, by its report, go; all others stay.
     """
 
-    def __init__(
-        self, path: Path, *, inputs: Collection[Path] = (), overwrite: bool = False, option: str = "--out"
-    ) -> None:
-        self.path, self._inputs, self._overwrite, self._option = Path(path), inputs, overwrite, option
+    def __init__(self, path: Path, *, inputs: Collection[Path] = (), overwrite: bool = False) -> None:
+        self.path, self._inputs, self._overwrite = Path(path), inputs, overwrite
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        self._target = check_out(self.path, self._option)
+        self._target = check_out(self.path)
         if _holds_files(self._target) and not self._overwrite:
             cure = "Name another, or add --overwrite."
-            bad_value(self._option, "a new or empty folder", f"{self.path}, which holds files", cure)
+            bad_value("--out", "a new or empty folder", f"{self.path}, which holds files", cure)
         for path in self._inputs if self._target.is_dir() else ():
             if any(path.exists() and path.samefile(e) for e in self._target.iterdir() if e.is_file()):
                 got = f"{self.path}, which holds {path}"  # and which the run may replace or delete
-                bad_value(self._option, "a folder that holds no input of the run", got, "Name another.")
+                bad_value("--out", "a folder that holds no input of the run", got, "Name another.")
         self._staging = _hidden(self._target)
         with ExitStack() as stack:
             try:
@@ -157,7 +154,7 @@ class OutFolder:
             except OSError as error:
                 cure = "Name another with --out, or free disk space and check its permissions."
                 got = f"{self.path} ({reason_of(error)})"
-                bad_value(self._option, "a folder that can be written to", got, cure)
+                bad_value("--out", "a folder that can be written to", got, cure)
             self._stack = stack.pop_all()
         return self
 
@@ -173,7 +170,7 @@ class OutFolder:
         # Beside it writes a run that began before the folder was there.
         if (staging != beside and _held(beside)) or not _take(staging, stack):
             got = f"{self.path}, which another process is writing to"
-            bad_value(self._option, "a folder that no other run has", got, "Wait for it, or name another.")
+            bad_value("--out", "a folder that no other run has", got, "Wait for it, or name another.")
         stack.callback(shutil.rmtree, staging, ignore_errors=True)
         if shutil.disk_usage(staging).free < LEAST_FREE_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -263,7 +263,8 @@ def make_rig(left: Camera, right: Camera, pose: Any, *, rectified: bool = False)
     sizes = [_pixels(camera.size, name) for name, camera in cameras]
     lens_left, lens_right = (lens_of(camera, name) for name, camera in cameras)
     rectified = rectified and lens_left is lens_right is None
-    return Rig(Ks[0], Ks[1], E, *sizes, distortion=(lens_left, lens_right), rectified=rectified)
+    lenses = (lens_left, lens_right)
+    return Rig(Ks[0], Ks[1], E, sizes[0], sizes[1], distortion=lenses, rectified=rectified)
 
 
 def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any = None) -> Rig:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value, warn
+from geodiff_plugin.formats.depth import KITTI_ROW
 from geodiff_plugin.formats.rigs import (
     Camera,
     CameraChoice,
@@ -32,7 +33,6 @@ MM_PER_METRE = 1000.0
 ENTRY = re.compile(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*?)[ \t]*$", re.MULTILINE)
 #: Files are printed with three decimals, so an honest cam1 agrees with doffs better than this.
 DOFFS_TOLERANCE_PX = 0.05
-KITTI_ROW = re.compile(r"^\s*(\w+)\s*:(.*)$", re.MULTILINE)
 PROJECTION = re.compile(r"(P_rect_|P)(\d+)")
 #: KITTI's grey pair and colour pair.
 PAIRS = ((0, 1), (2, 3))
