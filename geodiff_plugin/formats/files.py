@@ -53,10 +53,17 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
 
 @contextmanager
 def open_image(path: str | os.PathLike[str], name: str, what: str = "an image file") -> Iterator[Image.Image]:
-    """Open an image file with Pillow; what is none, or damaged, as the block may find, is refused."""
+    """Open an image file with Pillow, HEIC by pillow-heif; what is none, or damaged, is refused."""
     from PIL import Image, UnidentifiedImageError
 
     file = check_file(path, name, what)
+    if file.suffix.lower() in (".heic", ".heif"):
+        try:
+            import pillow_heif
+        except ImportError:
+            cure = "Run: pip install pillow-heif, or convert it to PNG or JPEG."
+            bad_value(name, what, f"{file}, which Pillow reads with pillow-heif only", cure)
+        pillow_heif.register_heif_opener()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # what is too large is an error

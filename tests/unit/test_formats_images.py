@@ -1,6 +1,7 @@
 """Images from files and from memory, and lens distortion taken out of them."""
 
 import io
+import sys
 import warnings
 
 import numpy as np
@@ -111,6 +112,19 @@ def test_a_cut_off_image_is_a_sentence(tmp_path, suffix):
     path.write_bytes(b"hello")
     with pytest.raises(ValueError, match="a format that Pillow does not read"):
         read_image(path)
+
+
+def test_heic_is_read_where_pillow_heif_is(tmp_path, monkeypatch):
+    path = tmp_path / "x.HEIC"
+    path.write_bytes(b"no image")
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(ValueError, match="pillow-heif only. Run: pip install pillow-heif"):
+        read_image(path)
+    monkeypatch.undo()
+    heif = pytest.importorskip("pillow_heif")
+    grey = Image.fromarray(np.full((40, 60, 3), 77, np.uint8))
+    heif.from_pillow(grey).save(path, quality=-1)
+    assert np.abs(read_image(path)[0] - 77 / 255).mean() < 0.02
 
 
 def test_an_image_beyond_pillows_limit_says_so(tmp_path, monkeypatch):
