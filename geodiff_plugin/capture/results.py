@@ -12,7 +12,7 @@ from PIL import Image
 
 from geodiff_plugin.capture.agreement import DepthFrame, agreed
 from geodiff_plugin.capture.capture import Capture, choose_neighbours
-from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb
+from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb, write_vertices
 from geodiff_plugin.formats.depth import write_depth_mm, write_depth_npy
 from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.formats.sfm import write_colmap
@@ -32,9 +32,8 @@ CELL_SHARE, LEAST_CONFIDENCE = 0.004, 0.5
 MOST_POINTS = 200_000
 #: Frames after which their points are merged, so that a long capture fits the memory.
 MERGED_AFTER = 20
-VERTEX = np.dtype(
-    [(n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")] + [(n, "u1") for n in ("red", "green", "blue")]
-)
+#: Columns of the cloud.
+VERTEX = (*"xyz", "nx", "ny", "nz", "red", "green", "blue")
 
 
 def _frame(capture: Capture, out: Path, maps: Sequence[str], name: str) -> DepthFrame:
@@ -78,7 +77,8 @@ def write_results(capture: Capture, out: Path, names: Sequence[str], export: Seq
     """
     load = partial(_frame, capture, out, AGREED)
     cloud, normals = fuse(names, load, capture.image)
-    write_normal_ply(out / "cloud.ply", cloud, normals, capture.unit)
+    parts, count = (cloud.points_m, normals, cloud.colours), len(cloud.points_m)
+    write_vertices(out / "cloud.ply", "world frame", capture.unit, count, VERTEX, [parts])
     cameras = [(f.K, f.E, f.depth.shape[::-1]) for f in map(load, names)]
     write_glb(out / "cloud.glb", cloud.thinned(GLB_POINTS), cameras)
     if "colmap" in export:
@@ -86,7 +86,7 @@ def write_results(capture: Capture, out: Path, names: Sequence[str], export: Seq
         seen = [solved.seen[capture.names.index(name)] for name in names]
         write_workspace(out / "colmap", map(load, names), capture.image, solved.points, seen)
     _sheet(capture, out, names)
-    return {"cloud_points": len(cloud.points_m)}
+    return {"cloud_points": count}
 
 
 def _sheet(capture: Capture, out: Path, names: Sequence[str]) -> None:
@@ -161,23 +161,6 @@ def _thinned(rows: np.ndarray, cell: float) -> np.ndarray:
     _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
     sums = [np.bincount(inverse, rows[:, column], len(counts)) for column in range(rows.shape[1])]
     return np.stack(sums, -1) / counts[:, None]
-
-
-def write_normal_ply(path: Path, cloud: Cloud, normals: np.ndarray, unit: str | None) -> None:
-    """Write a cloud with normals as binary PLY."""
-    columns = (*cloud.points_m.T, *normals.T, *cloud.colours.T)
-    vertices = np.rec.fromarrays(columns, dtype=VERTEX)
-    kinds = {"<f4": "float", "|u1": "uchar"}
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment world frame, {'metres' if unit else 'no unit'}",
-        f"element vertex {len(vertices)}",
-        *(f"property {kinds[VERTEX[name].str]} {name}" for name in VERTEX.names or ()),
-        "end_header\n",
-    ]
-    with atomic_path(path) as temporary:
-        temporary.write_bytes("\n".join(lines).encode() + vertices.tobytes())
 
 
 def write_workspace(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,22 +121,34 @@ def write_ply(
     ``unit`` is ``"m"``, or ``None`` for a depth without one; a comment of the file says which, and the frame.
     """
     count = int(np.count_nonzero(_usable(np.asarray(depth_m), valid)))
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment camera frame: x right, y down, z forward, {'metres' if unit else 'no unit'}",
-        f"element vertex {count}",
-        *(f"property float {name}" for name in ("x", "y", "z")),
-        *(f"property uchar {name}" for name in ("red", "green", "blue")),
-        "end_header\n",
-    ]
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write("\n".join(lines).encode("ascii"))
-        for cloud in _cloud_strips(depth_m, image_01, K, valid):
-            vertices = np.empty(len(cloud.points_m), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-            vertices["xyz"], vertices["rgb"] = cloud.points_m, cloud.colours
-            file.write(vertices.tobytes())
+    strips = ((cloud.points_m, cloud.colours) for cloud in _cloud_strips(depth_m, image_01, K, valid))
+    frame = "camera frame: x right, y down, z forward"
+    write_vertices(path, frame, unit, count, (*"xyz", "red", "green", "blue"), strips)
     return count
+
+
+def write_vertices(
+    path: str | os.PathLike[str],
+    frame: str,
+    unit: str | None,
+    count: int,
+    names: Sequence[str],
+    parts: Iterable[Sequence[np.ndarray]],
+) -> None:
+    """Write ``count`` vertices as binary little-endian PLY; a comment says their frame and unit.
+
+    Of every part the columns of its arrays together are called ``names``: floats, the last three colours.
+    """
+    kinds = ["float"] * (len(names) - 3) + ["uchar"] * 3
+    properties = [f"property {kind} {name}" for kind, name in zip(kinds, names, strict=True)]
+    comment = f"comment {frame}, {'metres' if unit else 'no unit'}"
+    lines = ["ply", "format binary_little_endian 1.0", comment, f"element vertex {count}", *properties]
+    vertex = np.dtype([(n, "<f4" if kind == "float" else "u1") for kind, n in zip(kinds, names, strict=True)])
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write("\n".join([*lines, "end_header\n"]).encode("ascii"))
+        for part in parts:
+            columns = [column for array in part for column in array.T]
+            file.write(np.rec.fromarrays(columns, dtype=vertex).tobytes())
 
 
 def _pyramid(K: np.ndarray, E: np.ndarray, size: tuple[int, int], length_m: float) -> np.ndarray:
