@@ -74,7 +74,7 @@ def calibration_text(path: str | os.PathLike[str]) -> str:
     """The text of a calibration file, of a COLMAP model without its points; kept until the file changes."""
     file = check_file(path, "calibration", "a calibration file")
     state = file.stat()
-    return _calibration_text(file.absolute(), state.st_size, state.st_mtime_ns)
+    return _calibration_text(file, state.st_size, state.st_mtime_ns)
 
 
 @lru_cache(maxsize=4)
