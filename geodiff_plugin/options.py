@@ -81,8 +81,8 @@ def check_options(options: Any, name_of: Callable[[Field[Any]], str] = flag_of) 
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions:
-    """Which prior runs, and how: what ``geodiff depth``, the page and the ComfyUI node have in common."""
+class PriorOptions:
+    """Which prior runs, and where: what every command that runs one has in common."""
 
     prior: str = declare("bundled", "'bundled', a hub id or a folder; KEY:folder says which kind.")
     space: str | None = declare(
@@ -90,11 +90,19 @@ class RunOptions:
         "Space in which the prior's map is affine, if its folder does not say: depth, disparity ...",
         choices=SPACES,
     )
-    option: tuple[str, ...] = declare(
-        (), "An option that only this prior has, as NAME=VALUE (GeoWizard: domain=outdoor)."
-    )
     steps: int | None = declare(
         None, "Denoising steps; by default the prior's own, at least 4.", low=1, high=1000
+    )
+    seed: int = declare(0, "Seed of the noise.", low=0, high=2**63 - 1)
+    device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(PriorOptions):
+    """How it runs: what ``geodiff depth``, the page and the ComfyUI node have in common."""
+
+    option: tuple[str, ...] = declare(
+        (), "An option that only this prior has, as NAME=VALUE (GeoWizard: domain=outdoor)."
     )
     ensemble: int = declare(
         1, "Number of members; with 2 or more, their spread is written as uncertainty.", low=1, high=1000
@@ -104,8 +112,6 @@ class RunOptions:
     )
     near: float | None = declare(None, "Nearest depth to search, metres.", above_0="metres")
     far: float | None = declare(None, "Farthest depth to search, metres.", above_0="metres")
-    seed: int = declare(0, "Seed of the noise.", low=0, high=2**63 - 1)
-    device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
     dtype: str = declare("float32", "float32, float16 or bfloat16.", choices=DTYPES)
     preset: str = declare(
         "default", "default, fast (coarser matches, poses as given), or paper (Algorithm 1).", choices=PRESETS

@@ -34,7 +34,7 @@ from geodiff_plugin.app.results import (
     write_scene,
 )
 from geodiff_plugin.cli.depth import Job
-from geodiff_plugin.cli.report import depth_summary
+from geodiff_plugin.cli.outputs import depth_summary
 
 #: A visitor's uploads, result and files are deleted after this long.
 FORGET_AFTER_S = 600

@@ -14,9 +14,9 @@ from PIL import Image, ImageDraw, ImageFont
 from geodiff_plugin.app import look
 from geodiff_plugin.app.measure import Reading, distance_m, metres, read_pixel
 from geodiff_plugin.cli.depth import Job
-from geodiff_plugin.cli.exports import cameras_of
-from geodiff_plugin.cli.report import REPORT, single_map
+from geodiff_plugin.cli.outputs import cameras_of, single_map
 from geodiff_plugin.formats import flying_points, make_cloud, write_glb
+from geodiff_plugin.formats.out import REPORT
 from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, ticks
 
 #: Pictures on the page are no larger than this; files to take home have every pixel.

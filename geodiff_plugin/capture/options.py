@@ -10,14 +10,14 @@ from pathlib import Path
 
 from geodiff_plugin import __version__
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.options import CAMERAS, OUTPUT, SPACES, check_options, declare
+from geodiff_plugin.options import CAMERAS, OUTPUT, PriorOptions, check_options, declare
 
 #: Right views of a frame, at most.
 NEIGHBOURS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class CaptureOptions:
+class CaptureOptions(PriorOptions):
     """What to do with a capture, as it was typed."""
 
     path: Path = declare(
@@ -56,18 +56,9 @@ class CaptureOptions:
     trajectory: Path | None = declare(
         None, "Of a video: lines of seconds tx ty tz qx qy qz qw, camera-to-world.", panel=CAMERAS
     )
-    prior: str = declare("bundled", "'bundled', a hub id or a folder.")
     prior_map: Path | None = declare(
         None, "Folder of depth maps of another model, NAME.npy or another map a frame, in place of a prior."
     )
-    space: str | None = declare(
-        None, "Space in which the prior's map is affine, if its folder does not say.", choices=SPACES
-    )
-    steps: int | None = declare(
-        None, "Denoising steps; by default the prior's own, at least 4.", low=1, high=1000
-    )
-    seed: int = declare(0, "Seed of the noise.")
-    device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
     processes: int | None = declare(
         None, "Processes that share the frames; by default one a core.", low=1, high=1024
     )

@@ -20,14 +20,14 @@ import typer
 from geodiff_plugin.capture.options import CaptureOptions
 from geodiff_plugin.cli.commands import Command, new_group
 from geodiff_plugin.cli.options import DepthOptions, start_pair
-from geodiff_plugin.cli.terminal import StopWatch
+from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, StopWatch
 from geodiff_plugin.formats.out import free_folder
 from geodiff_plugin.options import OUTPUT, SPACES, declare, help_of
 
 _out = partial(declare, panel=OUTPUT)
 
 
-def _imported(where: str) -> Callable[..., None]:
+def _imported(where: str) -> Callable[..., Any]:
     """A function of the package, imported when it is needed.
 
     OpenMP's threads spin while they wait, which on a busy machine takes the core from the thread that they
@@ -35,7 +35,7 @@ def _imported(where: str) -> Callable[..., None]:
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     module, _, name = where.rpartition(".")
-    function: Callable[..., None] = getattr(importlib.import_module(f"geodiff_plugin.{module}"), name)
+    function: Callable[..., Any] = getattr(importlib.import_module(f"geodiff_plugin.{module}"), name)
     return function
 
 
@@ -51,20 +51,23 @@ def _with_folder(options: DepthOptions, default: str) -> DepthOptions:
     return replace(options, out=Path(default) if options.overwrite else free_folder(Path(default)))
 
 
+def _leave(failed: bool) -> None:
+    if failed:
+        sys.exit(EXIT_SOME_FAILED)
+
+
 def _depth(options: DepthOptions) -> None:
     from geodiff_plugin.cli.pairs import is_many, start_many
     from geodiff_plugin.formats.recordings import is_bag
 
     if is_bag(options.left):
-        _imported("cli.many.run_bag")(options)
-        return
+        return _leave(_imported("cli.many.run_bag")(options))
     names = ("topic_left", "topic_right")
     options.refuse(names, "left out where LEFT is no bag", "given", "Images are LEFT and RIGHT.")
     if is_many(options.left):
         options = replace(options, out=options.out or Path("geodiff-out"))
         refs = start_many(options)
-        _imported("cli.many.run_many")(options, refs)
-        return
+        return _leave(_imported("cli.many.run_many")(options, refs))
     options, watch = _with_folder(options, "geodiff-out"), StopWatch()
     with start_pair(options) as folder:
         with watch.stage("start"):
@@ -154,12 +157,6 @@ def _capture(options: CaptureOptions) -> None:
     _imported("cli.capture.run_and_report")(options)
 
 
-def _eval(_: None) -> typer.Typer:
-    from geodiff_plugin.cli.eval import eval_app
-
-    return eval_app
-
-
 COMMANDS = {
     "depth": Command(DepthOptions, _depth, "Metric depth of LEFT guided by RIGHT; of one pair, or of many."),
     "capture": Command(CaptureOptions, _capture, "Depth of a capture's frames, and one cloud of all."),
@@ -170,7 +167,7 @@ COMMANDS = {
     "submit": Command(_Submit, _later("cli.results.run_submit"), "Write what Middlebury and ETH3D take."),
     "app": Command(_Page, _Page.run, "Serve a web page on which to measure (needs the extra app)."),
     "convert": Command(_Convert, _later("cli.convert.run_convert"), "Make a folder for --prior of weights."),
-    "eval": Command(None, _eval, "Measure this package and its peers on data sets."),
+    "eval": Command(None, lambda _: _imported("cli.eval.eval_app"), "Measure it and others on data sets."),
 }
 app = new_group(
     "Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior.",

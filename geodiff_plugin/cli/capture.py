@@ -9,13 +9,13 @@ from typing import Any
 
 from geodiff_plugin.capture.options import CaptureOptions
 from geodiff_plugin.capture.run import run_capture
-from geodiff_plugin.cli.exports import write_maps
-from geodiff_plugin.cli.terminal import collected_warnings, say, warn_once
+from geodiff_plugin.cli.outputs import write_maps
+from geodiff_plugin.cli.terminal import collected_warnings, say
 
 
 def run_and_report(options: CaptureOptions) -> None:
     """Depth of every frame, the answer on stdout, and exit code 1 where a frame failed."""
-    with collected_warnings(warn_once()):
+    with collected_warnings():
         report = run_capture(options, write_maps, say)
     print(json.dumps(report, indent=2) if options.json else _summary(report, options.out))
     if any("error" in frame for frame in report["frames"]):

@@ -13,7 +13,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.converters import depthfm, ppd, read_checkpoint, save_weights
 from geodiff_plugin.cli.converters.marigold_v2 import MARIGOLD_V2, convert_marigold_v2
 
-#: Kind -> module with ``recognises(checkpoint)`` and ``write(checkpoint, folder, part)``.
+#: Kind -> module with the ``KEYS`` that tell it, and ``write(checkpoint, folder, part)``.
 CONVERTERS = {"depthfm": depthfm, "ppd": ppd}
 #: Keys of an unknown checkpoint that the error names.
 NAMED_KEYS = 8
@@ -59,7 +59,7 @@ def _convert_file(source: Path, folder: Path, part: str | None) -> str:
     """Convert a checkpoint into an empty folder; what kind it was."""
     checkpoint = read_checkpoint(source)
     for kind, converter in CONVERTERS.items():
-        if converter.recognises(checkpoint):
+        if set(checkpoint) >= converter.KEYS:
             converter.write(checkpoint, folder, part)
             return kind
     got = f"{source} with the keys {', '.join(map(str, list(checkpoint)[:NAMED_KEYS])) or 'of nothing'}"

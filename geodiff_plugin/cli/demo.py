@@ -13,7 +13,7 @@ import torch
 from geodiff_plugin.bundled.demo_pair import DemoPair, read_demo_pair
 from geodiff_plugin.cli.depth import estimate_and_write
 from geodiff_plugin.cli.options import DepthOptions
-from geodiff_plugin.cli.report import single_map, summary_line
+from geodiff_plugin.cli.outputs import single_map, summary_line
 from geodiff_plugin.cli.terminal import StopWatch, new_table, say, show
 from geodiff_plugin.evaluation.metrics import align, evaluate_depth
 from geodiff_plugin.formats import atomic_path

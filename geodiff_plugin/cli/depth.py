@@ -16,12 +16,18 @@ import torch
 
 from geodiff_plugin._checks import bad_value, noted, warn
 from geodiff_plugin.bundled import no_bars
-from geodiff_plugin.cli.exports import check_image_names, write_exports, write_maps, write_undistorted
 from geodiff_plugin.cli.inputs import Inputs, read_inputs
-from geodiff_plugin.cli.options import DepthOptions
-from geodiff_plugin.cli.report import REPORT, build_report, summary_line
-from geodiff_plugin.cli.terminal import StopWatch, collected_warnings, say, warn_once
-from geodiff_plugin.formats.out import OutFolder
+from geodiff_plugin.cli.options import DepthOptions, told_apart
+from geodiff_plugin.cli.outputs import (
+    build_report,
+    summary_line,
+    write_exports,
+    write_maps,
+    write_undistorted,
+)
+from geodiff_plugin.cli.terminal import StopWatch, collected_warnings, say
+from geodiff_plugin.formats.out import REPORT, OutFolder
+from geodiff_plugin.formats.sfm import check_colmap_names
 from geodiff_plugin.priors import find_prior
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runtime.machine import pick_device
@@ -77,7 +83,9 @@ class Job:
         """Read the views and the cameras, and see that they fit; arguments as for ``read_inputs``."""
         with self.stage("calibration"):
             self.inputs = read_inputs(self.options, self.options.config(), frames, names)
-            check_image_names(self.options, self.inputs)
+        # Before the work that it would lose.
+        if "colmap" in self.options.export and not self.inputs.undistorted:
+            check_colmap_names(told_apart(self.options.photographs().values()))
 
     def guide(self, pipe: Any, progress: bool, **further: Any) -> None:
         """Call the pipeline as the options and ``further`` say, if wanted with a progress bar on stderr."""
@@ -126,7 +134,7 @@ def estimate_and_write(
     ``start_pair`` has seen the options and given the folder, which is held; ``watch`` has the stages so far.
     """
     job = Job(options, folder, watch)
-    with collected_warnings(warn_once()):
+    with collected_warnings():
         device = pick_device(options.device)
         job.read()
         for sentence in () if options.quiet else job.inputs.guidance.assumed:

@@ -70,4 +70,4 @@ def _list(options: _ListOptions) -> None:
 
 _COMMANDS = {name: Command(each.options, partial(_run, name), each.about) for name, each in COMMANDS.items()}
 _COMMANDS["list"] = Command(_ListOptions, _list, "Say which data sets are there; list the methods.")
-eval_app = new_group("Measure this package and its peers on data sets.", _COMMANDS)
+eval_app = new_group("Measure this package on data sets, beside other methods.", _COMMANDS)

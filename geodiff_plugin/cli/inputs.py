@@ -45,12 +45,9 @@ Lenses = tuple[Distortion | None, ...]
 class Inputs:
     """The views, ready to be guided by.
 
-    Attributes:
-        left: ``(H, W, 3)`` float32 in [0, 1], EXIF orientation applied.
-        rig: cameras of both, in pixels of these images; the left one's twice where there is no right one.
-        guidance: the right view, and those beside it, with the settings of the preset.
-        undistorted: whether lens distortion was taken out of the images.
-        prior_map: ``(h, w)`` of ``--prior-map``, NaN where unknown; or ``None``.
+    ``left`` is ``(H, W, 3)`` float32 in [0, 1], EXIF orientation applied; ``rig`` the cameras of both views
+    in pixels of these images, the left one's twice without a right one; ``guidance`` holds all other views;
+    ``undistorted`` says whether lens distortion was taken out; ``prior_map`` is ``(h, w)``, NaN unknown.
     """
 
     left: np.ndarray
@@ -210,12 +207,7 @@ def _known_length(
         cure = "Two pixels of LEFT and the distance of the two places, such as 100,200,400,210,1.5."
         bad_value("--known-length", "X1,Y1,X2,Y2,METRES", repr(text), cure)
     if lens is not None:
-        straight = undistorted_pixels(np.array([[x1, y1], [x2, y2]]), K, lens)
-        if not np.isfinite(straight).all():
-            got = f"{text}, of which the lens model has no ray"
-            cure = "Choose ends nearer to the middle of LEFT, or check --distortion."
-            bad_value("--known-length", "between two pixels that the lens shows", got, cure)
-        (x1, y1), (x2, y2) = straight.tolist()
+        (x1, y1), (x2, y2) = undistorted_pixels(np.array([[x1, y1], [x2, y2]]), K, lens).tolist()
     return x1, y1, x2, y2, metres
 
 

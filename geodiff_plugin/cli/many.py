@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import errno
 import json
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -20,9 +19,9 @@ from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.cli.depth import Job, load_guided_prior
 from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, check_files, out_folder_of
-from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, check_pair, options_of, start_many
-from geodiff_plugin.cli.report import read_report
-from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, collected_warnings, new_table, say, show, warn_once
+from geodiff_plugin.cli.outputs import read_report
+from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, options_of, start_many, with_right
+from geodiff_plugin.cli.terminal import collected_warnings, new_table, say, show
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import atomic_path, reason_of, write_text
 from geodiff_plugin.formats.reading import has_pose_per_image
@@ -96,7 +95,7 @@ class Stages:
         """Look at the files, take the folder, decode the views."""
         ref: PairRef = item.payload
         options = options_of(ref, self._options)
-        check_pair(ref, options)
+        with_right(ref, options).check_all()
         check_files(options, photographs=ref.frame is None)
         held = self._folders[item.key] = ExitStack()
         with _ends_run_on_full_disk():
@@ -177,17 +176,14 @@ def finished_row(options: DepthOptions) -> Row | None:
         return None
     wanted, of_fields = options.as_json(), DepthOptions.__dataclass_fields__
     others = [n for n in wanted if n not in NOT_OF_THE_RESULT and wanted[n] != made.get(n, wanted[n])]
-    if others:
-        changes = ", ".join(f"{flag_of(of_fields[n])} {made[n]} instead of {wanted[n]}" for n in others)
-        cure = "Name another --out, or add --overwrite."
-        expected, got = "a folder of results of the same options", f"{options.out}, made with {changes}"
-        bad_value("--out", expected, got, cure)
+    changes = [f"made with {flag_of(of_fields[n])} {made[n]} instead of {wanted[n]}" for n in others]
     digests = report.get("pair", {}).get("sha256", {})
     changed = [path for path, digest in _digests(options).items() if digests.get(path, digest) != digest]
-    if changed:
-        got = f"{options.out}, made before {' and '.join(changed)} changed"
+    changes += [f"made before {path} changed" for path in changed]
+    if changes:
         cure = "Name another --out, add --overwrite to repeat all pairs, or remove this folder to repeat one."
-        bad_value("--out", "a folder of results of the same files", got, cure)
+        got = f"{options.out}, {', '.join(changes)}"
+        bad_value("--out", "a folder of results of the same options and files", got, cure)
     return row
 
 
@@ -218,13 +214,8 @@ def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
             bad_value("--baseline", "left out with many pairs of one model", str(calib[0]), cure)
 
 
-def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
-    """Run the command on all pairs, answer on stdout, and leave with a code if one of them failed."""
-    if _any_fails(options, refs):
-        sys.exit(EXIT_SOME_FAILED)
-
-
-def _any_fails(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
+def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
+    """Run the command on all pairs, and answer on stdout; whether one of them failed."""
     assert options.out is not None
     _refuse_one_length(options, refs)
     device, _ = pick_device(options.device), options.config()
@@ -253,7 +244,7 @@ def _any_fails(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
         device = torch.device("cuda", process.local % torch.cuda.device_count())
     stages = Stages(options if process.index == 0 else replace(options, quiet=True), device)
     try:
-        with collected_warnings(warn_once()), _ends_run_on_full_disk():
+        with collected_warnings(), _ends_run_on_full_disk():
             records = runner.run(
                 stages.read, stages.evidence, stages.guide, stages.write, release=stages.release
             )
@@ -317,8 +308,8 @@ def _answer(rows: Sequence[Row], options: DepthOptions, out: Path) -> None:
         say(f"geodiff: {out / SUMMARY} could not be written ({reason_of(error)}).")
 
 
-def run_bag(options: DepthOptions) -> None:
-    """Depth of every pair of a bag as a bag.
+def run_bag(options: DepthOptions) -> bool:
+    """Depth of every pair of a bag as a bag; whether one of them failed.
 
     The results lie in a folder beside ``--out``, named ``NAME-frames``, from which the same command goes on
     after it was interrupted; the bag is written when all pairs are done, without those that failed.
@@ -332,7 +323,7 @@ def run_bag(options: DepthOptions) -> None:
     frames = out.with_name(f"{out.stem}-frames")
     options, frame_id = _with_its_cameras(replace(options, out=frames), frames)
     refs = start_many(options)
-    failed = _any_fails(options, refs)
+    failed = run_many(options, refs)
 
     def results() -> Iterator[tuple[Stamp, np.ndarray, np.ndarray]]:
         for ref, (stamp, _) in zip(refs, pairs, strict=True):
@@ -343,8 +334,7 @@ def run_bag(options: DepthOptions) -> None:
     count = write_depth_bag(out, results(), frame_id, options.encoding)
     if not options.quiet:
         say(f"{out}: {count} depth images ({options.encoding}) of {len(pairs)} pairs")
-    if failed:
-        sys.exit(EXIT_SOME_FAILED)
+    return failed
 
 
 def _with_its_cameras(options: DepthOptions, folder: Path) -> tuple[DepthOptions, str]:

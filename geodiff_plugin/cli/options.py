@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from dataclasses import MISSING, dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -28,11 +28,6 @@ WAYS = {
 }
 #: Fields that hold paths, but not of files that are read beside the photographs.
 PHOTOGRAPHS_AND_OUT = ("left", "right", "view", "out")
-
-
-def undistorted_name(number: int) -> str:
-    """File of a view without its lens distortion: 1 for the left one, 2 for the right one, and so on."""
-    return "undistorted.png" if number == 1 else f"undistorted-{number}.png"
 
 
 def told_apart(paths: Collection[Path]) -> list[str]:
@@ -160,7 +155,7 @@ class DepthOptions(RunOptions):
         self.camera_pair()
         for holds, names, expected, got, cure in self._excluded():
             if holds:
-                self.refuse(names, expected, got, cure)
+                self.refuse(names.split(), expected, got, cure)
         if (self.prior == "map") != (self.prior_map is not None):
             beside = "no --prior-map" if self.prior_map is None else "--prior-map"
             bad_value("--prior-map", "given in place of a --prior", f"--prior {self.prior} and {beside}")
@@ -176,29 +171,33 @@ class DepthOptions(RunOptions):
             if len(given) not in counts:
                 bad_value(option, f"given once for each of {views} --view", f"{len(given)} times")
 
-    def _excluded(self) -> Iterator[tuple[bool, tuple[str, ...], str, str, str]]:
+    def _excluded(self) -> list[tuple[bool, str, str, str, str]]:
         """When, which options, and what a message says that they must be, what came instead, and the cure."""
-        alone, without_points = self.right is None, self.points is None
+        alone, no_points, no_disparity = (v is None for v in (self.right, self.points, self.disparity))
+        paper, posed = self.preset == "paper", not self.estimate_pose
         default = "given with the default preset", "--preset paper"
-        paper, second = (
-            self.preset == "paper",
-            ("given with RIGHT", "no RIGHT", "It belongs to a second view."),
-        )
-        yield paper, ("points", "disparity"), *default, "Algorithm 1 has no points."
-        yield paper, ("view",), *default, "Algorithm 1 has two views."
         together = "given together with --estimate-pose", "no --estimate-pose"
-        yield not self.estimate_pose, ("fov", "known_length"), *together, ""
-        names = ("calib", "cameras", "e", "view_e", "cx_right")
-        cure = "Poses are given or estimated. For K alone give --K, or --fx --fy --cx --cy."
-        yield self.estimate_pose, names, "left out with --estimate-pose", "both", cure
-        cure = "It chooses among the cameras of a file."
-        yield not self.calib, ("cameras",), "given with --calib only", "no --calib", cure
-        yield without_points, ("points_scale", "points_calib"), "given with --points", "no --points", ""
-        yield not without_points, ("disparity",), "given in place of --points", "both", ""
-        neither, known = without_points and self.disparity is None, "given with --points or --disparity"
-        yield neither, ("points_confidence",), known, "neither", ""
-        yield alone and self.disparity is None, ("baseline", "cx_right"), *second
-        yield alone, ("e", "k_right", "view", "estimate_pose"), *second
+        known = "Poses are given or estimated. For K alone give --K, or --fx --fy --cx --cy."
+        second = "given with RIGHT", "no RIGHT", "It belongs to a second view."
+        of_file = "given with --calib only", "no --calib", "It chooses among the cameras of a file."
+        return [
+            (paper, "points disparity", *default, "Algorithm 1 has no points."),
+            (paper, "view", *default, "Algorithm 1 has two views."),
+            (posed, "fov known_length", *together, ""),
+            (not posed, "calib cameras e view_e cx_right", "left out with --estimate-pose", "both", known),
+            (not self.calib, "cameras", *of_file),
+            (no_points, "points_scale points_calib", "given with --points", "no --points", ""),
+            (not no_points, "disparity", "given in place of --points", "both", ""),
+            (
+                no_points and no_disparity,
+                "points_confidence",
+                "given with --points or --disparity",
+                "neither",
+                "",
+            ),
+            (alone and no_disparity, "baseline cx_right", *second),
+            (alone, "e k_right view estimate_pose", *second),
+        ]
 
     def cameras_way(self) -> str:
         """How the cameras are given, or with ``--estimate-pose`` K: a key of ``WAYS``, or ``"EXIF"``."""

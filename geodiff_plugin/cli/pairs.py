@@ -9,7 +9,7 @@ import csv
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,20 +28,14 @@ COLUMNS = ("pair", "result", "near_m", "median_m", "far_m", "verdict", "confiden
 LISTS = (".csv", ".tsv", ".txt")
 #: Files of maps, the first of a name is taken.
 MAPS = (".npy", ".npz", ".pfm", ".png")
-#: A list's heading, which names no file, begins with this.
-HEADING = "left"
 
 
 @dataclass(frozen=True)
 class PairRef:
-    """One pair of many.
+    """One pair of many, in a folder ``name`` below ``--out`` that no other pair has.
 
-    Attributes:
-        name: of its folder below ``--out``; no two pairs share one.
-        left: left image, or the video that it is a frame of.
-        right: likewise; ``None`` where the video has both views side by side.
-        calib: its own calibration, or ``None`` for that of the run.
-        frame: number in the video or the bag, from 0; ``None`` for images.
+    ``left`` and ``right`` are images, or the videos that they are a frame of, ``frame`` counts from 0; where
+    a video has both views side by side, ``right`` is ``None``. ``calib`` is ``None`` for that of the run.
     """
 
     name: str
@@ -56,10 +50,9 @@ def is_many(left: Path) -> bool:
     return os.path.isdir(left) or left.suffix.lower() in LISTS or is_video(left)
 
 
-def check_pair(ref: PairRef, options: DepthOptions) -> None:
-    """Check the options of one of many pairs; both views may lie in one video."""
-    both_in_one = ref.frame is not None and ref.right is None
-    (replace(options, right=ref.left) if both_in_one else options).check_all()
+def with_right(ref: PairRef, options: DepthOptions) -> DepthOptions:
+    """Options of one of many pairs for checks, to which one video of both views is each view's."""
+    return options if ref.frame is None or ref.right is not None else replace(options, right=ref.left)
 
 
 def start_many(options: DepthOptions) -> list[PairRef]:
@@ -74,9 +67,10 @@ def start_many(options: DepthOptions) -> list[PairRef]:
         if "colmap" in options.export:
             cure = "A model names image files: extract the frames, and give their folders."
             bad_value("--export colmap", "left out with a video", "given", cure)
-    check_pair(refs[0], each[0])
+    first = with_right(refs[0], each[0])
+    first.check_all()
     if options.estimate_pose or all(ref.calib is None for ref in refs):
-        replace(each[0], right=refs[0].right or refs[0].left).cameras_way()
+        first.cameras_way()
     check_files(replace(options, prior_map=each[0].prior_map), photographs=False)
     _check_summary(options)
     return refs
@@ -101,15 +95,10 @@ def find_pairs(options: DepthOptions) -> list[PairRef]:
     left, right = options.left, options.right
     if is_bag(left):
         return _frames(len(list_pairs(left, options.bag_topics(), options.tolerance)), left, None)
+    tell = (lambda _: None) if options.quiet else say
     if os.path.isdir(left):
-        refs, assumed = _of_folders(left, right)
-    elif is_video(left):
-        refs, assumed = _of_videos(left, right)
-    else:
-        return _of_list(left, right)
-    if assumed and not options.quiet:
-        say(f"assumed: {assumed}")
-    return refs
+        return _of_folders(left, right, tell)
+    return _of_videos(left, right, tell) if is_video(left) else _of_list(left, right)
 
 
 def options_of(ref: PairRef, options: DepthOptions) -> DepthOptions:
@@ -139,8 +128,8 @@ def _natural(path: Path) -> tuple[list[str | int], str]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
 
-def _of_folders(left: Path, right: Path | None) -> tuple[list[PairRef], str]:
-    """The pairs, and what was assumed about which views belong together, for the user to check."""
+def _of_folders(left: Path, right: Path | None, tell: Callable[[str], None]) -> list[PairRef]:
+    """The pairs; which views belong together is told where it was assumed."""
     if right is None or not os.path.isdir(right):
         got = "nothing" if right is None else right
         bad_value("RIGHT", "a folder where LEFT is one", got, "Or let LEFT be an image, or a list of pairs.")
@@ -154,26 +143,28 @@ def _of_folders(left: Path, right: Path | None) -> tuple[list[PairRef], str]:
             bad_value(name, "a folder of images with different names", f"two {twice[0]} in {folder}", cure)
     of_stem = {path.stem: path for path in rights}
     if not {path.stem for path in lefts} & set(of_stem) and len(lefts) == len(rights):
-        refs = [PairRef(a.stem, a, b) for a, b in zip(lefts, rights, strict=True)]  # im0_L.png, im0_R.png
-        first, last = (f"{a.name} with {b.name}" for a, b in ((lefts[i], rights[i]) for i in (0, -1)))
-        return refs, f"The two folders share no name, so images are paired in order: {first} to {last}."
+        pairs = list(zip(lefts, rights, strict=True))  # im0_L.png, im0_R.png
+        first, last = (f"{a.name} with {b.name}" for a, b in (pairs[0], pairs[-1]))
+        tell(f"assumed: The two folders share no name, so images are paired in order: {first} to {last}.")
+        return [PairRef(a.stem, a, b) for a, b in pairs]
     if alone := {path.stem for path in lefts} ^ set(of_stem):
         cure = "Remove it, or write a list of pairs: LEFT,RIGHT[,CALIB] a line."
         got = f"{len(lefts)} left and {len(rights)} right images; {min(alone)} has no partner"
         bad_value("LEFT and RIGHT", "folders of images with the same names, or as many in order", got, cure)
-    return [PairRef(path.stem, path, of_stem[path.stem]) for path in lefts], ""
+    return [PairRef(path.stem, path, of_stem[path.stem]) for path in lefts]
 
 
-def _of_videos(left: Path, right: Path | None) -> tuple[list[PairRef], str]:
+def _of_videos(left: Path, right: Path | None, tell: Callable[[str], None]) -> list[PairRef]:
     frames = count_frames(left, "LEFT")
     if right is None:
-        return _frames(frames, left, None), f"{left} holds both views side by side; else name both videos."
+        tell(f"assumed: {left} holds both views side by side; else name both videos.")
+        return _frames(frames, left, None)
     if not is_video(right):
         bad_value("RIGHT", f"a video too ({', '.join(VIDEOS)}), or left out", right)
     if (others := count_frames(right, "RIGHT")) != frames:
         cure = "Cut them to the same moments first."
         bad_value("RIGHT", f"a video of {frames} frames, as the left one", f"{others} frames", cure)
-    return _frames(frames, left, right), ""
+    return _frames(frames, left, right)
 
 
 def _frames(count: int, left: Path, right: Path | None) -> list[PairRef]:
@@ -193,7 +184,7 @@ def _of_list(path: Path, right: Path | None) -> list[PairRef]:
     rows: list[list[Path]] = []
     for number, line in enumerate(csv.reader(text.splitlines(), delimiter="\t" if "\t" in text else ","), 1):
         cells = [cell.strip() for cell in line if cell.strip()]
-        heading = not rows and cells and cells[0].lower().startswith(HEADING) and not Path(cells[0]).suffix
+        heading = not rows and cells and cells[0].lower().startswith("left") and not Path(cells[0]).suffix
         if not cells or cells[0].startswith("#") or heading:
             continue
         if len(cells) not in (2, 3):

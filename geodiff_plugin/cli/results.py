@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.report import REPORT, read_report
+from geodiff_plugin.cli.outputs import read_report
 from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.formats import check_file, write_pfm
 from geodiff_plugin.formats.depth import disparity_of_depth
 from geodiff_plugin.formats.files import read_npy
-from geodiff_plugin.formats.out import write_text
+from geodiff_plugin.formats.out import REPORT, write_text
 from geodiff_plugin.plotting import check_video, depth_frames, write_depth_video
 
 #: Benchmarks by name, and where their files lie below the folder of a submission.
@@ -35,29 +35,18 @@ def _map(path: Path) -> np.ndarray:
     return mapped
 
 
-def _unit(frames: Sequence[Path], folders: Sequence[Path]) -> str | None:
-    """``"m"``, or ``None`` where no map has a unit; one range of colours cannot show both kinds."""
-    in_metres = [read_report(folder).get("unit", "m") is not None for folder in folders]
-    if any(in_metres) and not all(in_metres):
-        with_unit, without = frames[in_metres.index(True)], frames[in_metres.index(False)]
-        expected = "all in metres, or all without a unit"
-        bad_value("FRAME", expected, f"{with_unit} with and {without} without", "Make a video of each kind.")
-    return "m" if all(in_metres) else None
-
-
 def run_video(frames: Sequence[Path], out: Path, fps: float, near: float | None, far: float | None) -> None:
-    """Write the video and say what is in it."""
+    """Write the video, whose legend is in metres unless a report says that its map has none."""
     check_video(out, fps)
     files = [path / "depth.npy" if os.path.isdir(path) else path for path in frames]
     depths_m = [_map(file) for file in files]
-    shapes = [depth_m.shape for depth_m in depths_m]
-    for path, shape in zip(frames, shapes, strict=True):
-        if shape != shapes[0]:
-            (height, width), (first_height, first_width) = shape, shapes[0]
-            expected = f"all of one shape, {first_width}x{first_height} pixels as {frames[0]}"
-            bad_value("FRAME", expected, f"{path} of {width}x{height}", "Make a video of each size.")
-    unit = _unit(frames, [file.parent for file in files])
-    write_depth_video(out, depth_frames(depths_m, near=near, far=far, unit=unit), fps)
+    sizes = ["{1}x{0}".format(*depth_m.shape) for depth_m in depths_m]
+    for path, size in zip(frames, sizes, strict=True):
+        if size != sizes[0]:
+            expected = f"all of one shape, {sizes[0]} pixels as {frames[0]}"
+            bad_value("FRAME", expected, f"{path} of {size}", "Make a video of each size.")
+    metric = all(read_report(file.parent).get("unit", "m") is not None for file in files)
+    write_depth_video(out, depth_frames(depths_m, near=near, far=far, unit="m" if metric else None), fps)
     print(f"{len(frames)} frames, {len(frames) / fps:.1f} s -> {out}")
 
 

@@ -44,33 +44,22 @@ class StopWatch:
         self.seconds[name] = time.perf_counter() - started
 
 
-def warn_once() -> Callable[[str], None]:
-    """Says a warning the first time that it is called with it."""
-    said = set[str]()
-
-    def tell(sentence: str) -> None:
-        if sentence not in said:
-            said.add(sentence)
-            say(f"warning: {sentence}")
-
-    return tell
-
-
 @contextmanager
-def collected_warnings(tell: Callable[[str], None]) -> Iterator[None]:
-    """Hand every warning of this package to ``tell`` as a sentence.
+def collected_warnings(tell: Callable[[str], None] = say) -> Iterator[None]:
+    """Tell every warning of this package once, as a line.
 
     Warnings of other packages are shown as usual, and the warning filters are restored at the end.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("always", category=UserWarning, module=r"geodiff_plugin")
-        shown_elsewhere = warnings.showwarning
+        shown_elsewhere, told = warnings.showwarning, set[str]()
 
         def collect(message: Any, category: Any, filename: str, *rest: Any, **named: Any) -> None:
-            if PACKAGE_FOLDER in Path(filename).resolve().parents:
-                tell(str(message))
-            else:
+            if PACKAGE_FOLDER not in Path(filename).resolve().parents:
                 shown_elsewhere(message, category, filename, *rest, **named)
+            elif str(message) not in told:
+                told.add(str(message))
+                tell(f"warning: {message}")
 
         warnings.showwarning = collect
         yield

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.options import DTYPES, OUTPUT, SPACES, check_options, declare, flag_of
+from geodiff_plugin.options import DTYPES, OUTPUT, SPACES, PriorOptions, check_options, declare, flag_of
 
 if TYPE_CHECKING:
     from geodiff_plugin.evaluation.baselines import Settings
@@ -90,13 +90,10 @@ class OutOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalOptions(OutOptions):
+class EvalOptions(OutOptions, PriorOptions):
     """What every command that runs a prior is told."""
 
-    prior: str = declare("bundled", "'bundled', a hub id or a folder.")
-    space: str | None = declare(None, "What the prior's map is affine in, unless it says.", choices=SPACES)
     dtype: str = declare("float32", f"{', '.join(DTYPES)}.", choices=DTYPES)
-    device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
 
 
 @dataclass(frozen=True, kw_only=True)

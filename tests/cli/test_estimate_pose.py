@@ -203,5 +203,3 @@ def test_the_estimation_of_poses_is_told_what_it_needs(told_to_estimate, millime
     np.testing.assert_allclose(told["points"], expected_points(), atol=1e-4)
     ends = (*straight(10, 12), *straight(50, 40), 1.5)
     assert told["known_length"] == pytest.approx(ends, abs=0.01)
-    with pytest.raises(InputError, match="--known-length must be between two pixels that the lens shows"):
-        told_to_estimate(known_length="0,0,60,40,1", distortion=("-1,0,0,0",))

@@ -138,7 +138,7 @@ def test_results_of_other_options_or_files_are_not_taken_for_these(geodiff, fini
         changed.write_bytes(whole + b"\n")
         answer = geodiff(*COMMAND)
         assert answer.code == 2 and answer.err.count("\n") == 1
-        assert f"same files; got {Path('out', 'a')}, made before {changed} changed. Name" in answer.err
+        assert f"options and files; got {Path('out', 'a')}, made before {changed} changed. Name" in answer.err
         changed.write_bytes(whole)
     assert before == contents(finished / "out")
 

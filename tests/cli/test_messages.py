@@ -14,7 +14,7 @@ from PIL import Image
 from geodiff_plugin import _checks
 from geodiff_plugin._checks import InputError, bad_type, bad_value
 from geodiff_plugin.cli.app import main
-from geodiff_plugin.cli.report import depth_summary, summary_line
+from geodiff_plugin.cli.outputs import depth_summary, summary_line
 from geodiff_plugin.formats import read_image
 from tests.cli.conftest import stop
 

@@ -33,22 +33,19 @@ def read_checkpoint(path: Path, kind: type[Any] = Mapping) -> Any:
     """What ``torch.save`` put into a file, on the CPU: a mapping, or a ``kind``; nothing in it is run."""
     if not os.path.isfile(path):
         bad_value("SRC", "a checkpoint file or a folder in diffusers' layout", path, "Check the path.")
-    cure = "Fetch it anew and compare its size with the original's."
     try:
         with torch.serialization.safe_globals(NUMPY_PARTS):
             content = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        reason = "it is no pickle of weights"  # torch's own advice is to run its code
+    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, ValueError, OSError) as error:
+        got = "one that cannot be read (is it cut off?)"  # torch's own advice may be to run its code
+        cure = "Fetch it anew and compare its size with the original's."
         if "GLOBAL" in str(error) or "Unsupported class" in str(error):
-            reason = "it holds more than tensors, numbers and text"
+            got = "one that cannot be read (it holds more than tensors, numbers and text)"
             cure = "Unpickling it would run code, which is never done: ask its authors for safetensors."
-    except (RuntimeError, EOFError, KeyError, ValueError, OSError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-    else:
-        if not isinstance(content, kind):
-            bad_value(str(path), f"a checkpoint that holds a {kind.__name__.lower()}", type(content).__name__)
-        return content
-    bad_value(str(path), "a checkpoint written by torch.save", f"one that cannot be read ({reason})", cure)
+        bad_value(str(path), "a checkpoint written by torch.save", got, cure)
+    if not isinstance(content, kind):
+        bad_value(str(path), f"a checkpoint that holds a {kind.__name__.lower()}", type(content).__name__)
+    return content
 
 
 def renamed(state: Mapping[str, Any], table: Sequence[tuple[str, str]], prefix: str = "") -> dict[str, Any]:

@@ -11,7 +11,6 @@ from diffusers import AutoencoderKL, FlowMatchEulerDiscreteScheduler, UNet2DCond
 from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.converters import fixed_prompt, write_card
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.loading import check_weights, reading
@@ -28,38 +27,33 @@ def unet_config(hparams: Mapping[str, Any]) -> dict[str, Any]:
 
     Options that change the weights' names or shapes in another way are noticed when these are loaded.
     """
-    try:
-        width, mults = hparams["model_channels"], hparams["channel_mult"]
-        attends = [2**level in set(hparams["attention_resolutions"]) for level in range(len(mults))]
-        kinds = ["CrossAttn" if attending else "" for attending in attends]
-        return {
-            "in_channels": hparams["in_channels"],
-            "out_channels": hparams["out_channels"],
-            "layers_per_block": hparams["num_res_blocks"],
-            "cross_attention_dim": hparams["context_dim"],
-            "block_out_channels": tuple(width * mult for mult in mults),
-            "use_linear_projection": hparams.get("use_linear_in_transformer", False),
-            # diffusers' name for the number of heads, for reasons of its history.
-            "attention_head_dim": hparams["num_heads"],
-            "down_block_types": tuple(f"{kind}DownBlock2D" for kind in kinds),
-            "up_block_types": tuple(f"{kind}UpBlock2D" for kind in reversed(kinds)),
-        }
-    except KeyError as error:
-        bad_value("ldm_hparams", f"a mapping with {error}", f"only {', '.join(sorted(hparams))}")
+    width, mults = hparams["model_channels"], hparams["channel_mult"]
+    attends = [2**level in set(hparams["attention_resolutions"]) for level in range(len(mults))]
+    kinds = ["CrossAttn" if attending else "" for attending in attends]
+    return {
+        "in_channels": hparams["in_channels"],
+        "out_channels": hparams["out_channels"],
+        "layers_per_block": hparams["num_res_blocks"],
+        "cross_attention_dim": hparams["context_dim"],
+        "block_out_channels": tuple(width * mult for mult in mults),
+        "use_linear_projection": hparams.get("use_linear_in_transformer", False),
+        # diffusers' name for the number of heads, for reasons of its history.
+        "attention_head_dim": hparams["num_heads"],
+        "down_block_types": tuple(f"{kind}DownBlock2D" for kind in kinds),
+        "up_block_types": tuple(f"{kind}UpBlock2D" for kind in reversed(kinds)),
+    }
 
 
 def _load_unet(state: Mapping[str, Tensor], hparams: Mapping[str, Any]) -> UNet2DConditionModel:
-    config, where = unet_config(hparams), "the checkpoint's state_dict"
+    config = unet_config(hparams)
     unet = UNet2DConditionModel(**config)
     wanted = unet.state_dict().keys()
     converted = convert_ldm_unet_checkpoint({LDM_PREFIX + k: v for k, v in state.items()}, config)
     fitting = {name: value for name, value in converted.items() if name in wanted}
     taken = {id(value) for value in fitting.values()}
-    check_weights(wanted - fitting.keys(), [k for k, v in state.items() if id(v) not in taken], where)
-    try:
-        unet.load_state_dict(fitting)
-    except RuntimeError as error:  # torch's message lists every tensor of another shape
-        bad_value(where, "of the shapes of its ldm_hparams", str(error))
+    unexpected = [name for name, value in state.items() if id(value) not in taken]
+    check_weights(wanted - fitting.keys(), unexpected, "the checkpoint's state_dict")
+    unet.load_state_dict(fitting)
     return unet
 
 
@@ -69,11 +63,6 @@ def _load_vae(part: str | None) -> AutoencoderKL:
     subfolder = "" if (Path(source) / "config.json").is_file() else "vae"
     with reading("--with", expected, repr(source), f"Fetch it once: hf download {VAE_ID}."):
         return AutoencoderKL.from_pretrained(source, subfolder=subfolder, use_safetensors=True)
-
-
-def recognises(checkpoint: Mapping[str, Any]) -> bool:
-    """Whether a checkpoint is of this kind, by its keys."""
-    return set(checkpoint) >= KEYS
 
 
 def write(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:

@@ -20,6 +20,10 @@ from geodiff_plugin.priors.loading import Layout, check_weights, load_component,
 from geodiff_plugin.priors.ppd import PixelDiT, PPDPipeline
 
 TRANSFORMER = "dit."
+KEYS = {
+    f"{TRANSFORMER}{name}.weight"
+    for name in ("x_embedder.proj", "blocks.0.attn.q_norm", "blocks.0.mlp.fc1", "proj_fusion.0")
+}
 #: The encoder whose tokens the transformer takes, of Depth Anything V2 Large, as transformers has it.
 ENCODER_ID, BACKBONE = "depth-anything/Depth-Anything-V2-Large-hf", "backbone."
 SIZES = ("hidden_size", "num_hidden_layers", "num_attention_heads", "mlp_ratio", "image_size", "patch_size")
@@ -46,24 +50,16 @@ def _load_encoder(part: str | None) -> Dinov2Model:
 
 def _load_transformer(state: Mapping[str, Tensor]) -> PixelDiT:
     """The transformer, of the size that its weights have."""
-    try:
-        width, _, side, _ = state["x_embedder.proj.weight"].shape
-        head_size = state["blocks.0.attn.q_norm.weight"].shape[0]
-        fusion = state["proj_fusion.0.weight"].shape[1]
-        hidden = state["blocks.0.mlp.fc1.weight"].shape[0]
-    except KeyError as error:
-        bad_value("the checkpoint", "the weights of Pixel-Perfect Depth", f"none called dit.{error.args[0]}")
+    width, _, side, _ = state["x_embedder.proj.weight"].shape
+    head_size = state["blocks.0.attn.q_norm.weight"].shape[0]
+    fusion = state["proj_fusion.0.weight"].shape[1]
+    hidden = state["blocks.0.mlp.fc1.weight"].shape[0]
     blocks = {name.split(".")[1] for name in state if name.startswith("blocks.")}
     dit = PixelDiT(width, len(blocks), width // head_size, side // 2, fusion - width, hidden / width)
     wanted = set(dit.state_dict())
     check_weights(wanted - set(state), set(state) - wanted, "the checkpoint")
     dit.load_state_dict(state)
     return dit.eval()
-
-
-def recognises(checkpoint: Mapping[str, Any]) -> bool:
-    """Whether a checkpoint is of this kind, by its keys."""
-    return {f"{TRANSFORMER}x_embedder.proj.weight", f"{TRANSFORMER}proj_fusion.0.weight"} <= set(checkpoint)
 
 
 def write(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:

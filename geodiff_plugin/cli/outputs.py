@@ -1,4 +1,4 @@
-"""``report.json``: every number of a guided call as one JSON document, and the line that sums it up."""
+"""What ``geodiff depth`` writes: maps, cloud, GLB, COLMAP, ``report.json``, and the line that sums it up."""
 
 from __future__ import annotations
 
@@ -10,15 +10,25 @@ from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from geodiff_plugin.cli.inputs import Inputs
-from geodiff_plugin.cli.options import DepthOptions
+from geodiff_plugin.cli.options import DepthOptions, told_apart
+from geodiff_plugin.formats import (
+    flying_points,
+    make_cloud,
+    write_colmap,
+    write_depth_mm,
+    write_depth_npy,
+    write_glb,
+    write_ply,
+)
+from geodiff_plugin.formats.out import REPORT
 from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.plotting import depth_figure, overview, share_figure
 from geodiff_plugin.runtime.confidence import expected_error
 from geodiff_plugin.runtime.machine import versions
 from geodiff_plugin.types import MetricDepthOutput
-
-REPORT = "report.json"
 
 
 def read_report(folder: Path) -> dict[str, Any]:
@@ -82,8 +92,11 @@ def _rescaled(E: np.ndarray, output: MetricDepthOutput) -> np.ndarray:
     return E * np.array([1.0, 1.0, 1.0, output.rescaled])
 
 
-def result_entries(output: MetricDepthOutput, guidance: GeometryGuidance) -> dict[str, Any]:
-    """What a report says of the result of a guided call on one image, whoever asked for it."""
+def build_report(
+    inputs: Inputs, output: MetricDepthOutput, pipe: Any, options: DepthOptions, warnings: list[str]
+) -> dict[str, Any]:
+    """The report without seconds and files, which are known when everything else is written."""
+    rig, guidance = inputs.rig, inputs.guidance
     depth_m, visible, error = single_map(output.prediction), None, math.nan
     if output.visible is not None:
         visible = single_map(output.visible).astype(bool)
@@ -94,7 +107,7 @@ def result_entries(output: MetricDepthOutput, guidance: GeometryGuidance) -> dic
         scale = {"scale_from": output.scale_from, "scale_spread": output.scale_spread}
         pose = {name: getattr(estimated, name) for name in found} | scale | {"assumed": estimated.notes}
     names = ("K", "scale", "shift", "global_scale", "own_scale", "prior_error", "unit", "assumed")
-    return {
+    report = {
         "depth": depth_summary(depth_m, visible),
         "verdict": verdict | {"signs": verdict.pop("indicators")},
         "photometric_error_mean": error,
@@ -108,15 +121,6 @@ def result_entries(output: MetricDepthOutput, guidance: GeometryGuidance) -> dic
         "pose": vars(output.poses[0]) if output.poses else None,
         "guidance": guidance.as_run().to_dict(),
         "versions": versions(),
-    }
-
-
-def build_report(
-    inputs: Inputs, output: MetricDepthOutput, pipe: Any, options: DepthOptions, warnings: list[str]
-) -> dict[str, Any]:
-    """The report without seconds and files, which are known when everything else is written."""
-    rig, rigs = inputs.rig, inputs.guidance.rigs
-    report = result_entries(output, inputs.guidance) | {
         "warnings": warnings,
         "undistorted": inputs.undistorted,
         "inputs": {
@@ -127,7 +131,9 @@ def build_report(
             "K_right": rig.K_right,
             "E": _rescaled(rig.E, output),
             "baseline_m": output.rescaled * float(np.linalg.norm(rig.E[:3, 3])),
-            "further_views": [{"K": each.K_right, "E": _rescaled(each.E, output)} for each in rigs[1:]],
+            "further_views": [
+                {"K": each.K_right, "E": _rescaled(each.E, output)} for each in guidance.rigs[1:]
+            ],
         },
         "prior": {
             "name": options.prior,
@@ -169,3 +175,75 @@ def summary_line(report: dict[str, Any], where: str) -> str:
     trusted += [f"{signs['points']} known depths"] if signs["points"] else []
     scale = [] if own is None else [f"prior's own metres x {own[0][0]:.2f}"]
     return "; ".join([metres, ", ".join(trusted), *scale, end])
+
+
+def write_maps(
+    folder: Path, output: MetricDepthOutput, left: np.ndarray, min_confidence: float = 0.0
+) -> dict[str, Any]:
+    """Write every file but exports and the report of one image, at its resolution; counts for the report.
+
+    The image ``left (H, W, 3)`` in [0, 1] colours the cloud, which pixels of less confidence are not part of.
+    """
+    depth_m, K = single_map(output.prediction).astype(np.float32), np.asarray(output.K)[0]
+    write_depth_npy(folder / "depth.npy", depth_m)
+    zeros = write_depth_mm(folder / "depth_mm.png", depth_m)
+    depth_figure(depth_m, unit=output.unit).save(folder / "depth.png")
+    maps = {name: np.asarray(extra)[0] for name, extra in output.extras.items()}
+    of_call = {name: getattr(output, name) for name in ("photometric_error", "uncertainty", "confidence")}
+    maps |= {name: single_map(value) for name, value in of_call.items() if value is not None}
+    for name, values in maps.items():
+        np.save(folder / f"{name}.npy", values.astype(np.float32))
+    flying, doubtful, error = flying_points(depth_m), np.zeros(depth_m.shape, dtype=bool), None
+    if output.visible is not None:
+        visible = single_map(output.visible).astype(bool)
+        Image.fromarray(visible.astype(np.uint8) * 255).save(folder / "visible.png")
+        error = np.where(visible, maps["photometric_error"], np.nan)
+    if output.confidence is not None:
+        share_figure(maps["confidence"], "confidence", 1.0).save(folder / "confidence.png")
+        doubtful = maps["confidence"] < min_confidence
+    overview(left, depth_m, maps.get("confidence"), error, output.unit).save(folder / "overview.png")
+    points = write_ply(folder / "cloud.ply", depth_m, left, K, valid=~(flying | doubtful), unit=output.unit)
+    return {
+        "depth_mm_zero_pixels": zeros,
+        "cloud_points": points,
+        "flying_points": int(flying.sum()),
+        "doubtful_points": int(doubtful.sum()),
+    }
+
+
+def write_undistorted(folder: Path, image_01: np.ndarray, number: int = 1) -> str:
+    """Write a view without its lens distortion, 1 for the left one, to which the depth belongs; its name."""
+    name = "undistorted.png" if number == 1 else f"undistorted-{number}.png"
+    Image.fromarray(np.rint(image_01.clip(0, 1) * 255).astype(np.uint8)).save(folder / name)
+    return name
+
+
+def cameras_of(
+    output: MetricDepthOutput, guidance: GeometryGuidance
+) -> tuple[tuple[np.ndarray, np.ndarray, tuple[int, int]], ...]:
+    """``(K, E, (width, height))`` of every view of one image, left one first; poses as the call used them."""
+    depth_m, K = single_map(output.prediction), np.asarray(output.K)[0].astype(np.float64)
+    further = zip(guidance.rigs, used_poses(output, guidance), guidance.rights, strict=True)
+    rights = ((rig.K_right, E, (image.shape[-1], image.shape[-2])) for rig, E, image in further)
+    return ((K, np.eye(4), (depth_m.shape[1], depth_m.shape[0])), *rights)
+
+
+def write_exports(folder: Path, output: MetricDepthOutput, inputs: Inputs, options: DepthOptions) -> None:
+    """Write what ``--export`` asks for, into a folder with the maps.
+
+    The cloud has points of at least the least confidence, without those that hang between two surfaces. The
+    images of a COLMAP model are the photographs, or where lens distortion was taken out written here.
+    """
+    depth_m, cameras = single_map(output.prediction), cameras_of(output, inputs.guidance)
+    keep = ~flying_points(depth_m)
+    if output.confidence is not None:
+        keep &= single_map(output.confidence) >= options.min_confidence
+    cloud = make_cloud(depth_m, inputs.left, cameras[0][0], keep)
+    if "glb" in options.export:
+        write_glb(folder / "cloud.glb", cloud, cameras)
+    if "colmap" in options.export:
+        names = told_apart(options.photographs().values())
+        if inputs.undistorted:
+            views = [inputs.left, *(image.permute(1, 2, 0).numpy() for image in inputs.guidance.rights)]
+            names = [write_undistorted(folder, image, number) for number, image in enumerate(views, 1)]
+        write_colmap(folder, [(name, *view) for name, view in zip(names, cameras, strict=True)], cloud)
