@@ -417,13 +417,15 @@ def spaces() -> dict[str, object]:
 
 @part
 def rules() -> dict[str, object]:
+    """Gradients that become smaller, references that change."""
     result = {}
     for name, make in RULES.items():
         rule = make(0.03)
-        steps = [
-            rule.step(_noise(2, 4, 3, 5, seed=k) * 10.0**k, _noise(2, 4, 3, 5, seed=9)) for k in range(3)
-        ]
-        result |= {f"{name}_{k}": step for k, step in enumerate(steps)}
+        for k in range(40):
+            gradient, reference = (_noise(2, 4, 3, 5, seed=seed) for seed in (k, 50 + k))
+            step = rule.step(gradient * 10.0 ** max(3 - k, 0), reference * (1 + k % 3))
+            if k in (0, 2, 39):
+                result[f"{name}_{k}"] = step
     return result
 
 

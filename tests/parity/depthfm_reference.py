@@ -8,17 +8,14 @@ The configurations below are what the parity test builds our pipeline from. Thei
 copied; xformers is replaced by PyTorch's own attention, which computes the same.
 """
 
-import argparse
 import json
-import sys
 import tempfile
-import types
-from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from tests.parity import authors
 from tests.parity.named_weights import draw, fill
 
 #: As in depthfm-v1.ckpt, but for fewer and narrower levels.
@@ -37,18 +34,13 @@ HPARAMS = {
     "context_dim": 16,
     "legacy": False,
 }
-VAE = {
-    "block_out_channels": (32,) * 4,
-    "down_block_types": ("DownEncoderBlock2D",) * 4,
-    "up_block_types": ("UpDecoderBlock2D",) * 4,
-    "layers_per_block": 1,
-}
+VAE = authors.WIDE_VAE
 SIZE, NOISING_STEP, STEPS = (64, 128), 400, 3
 
 
 def image_u8() -> np.ndarray:
     """``(H, W, 3)`` of noise."""
-    return (128 + 50 * draw("image", (*SIZE, 3))).clip(0, 255).astype(np.uint8)
+    return authors.picture("image", SIZE, 50.0)
 
 
 def prompt() -> np.ndarray:
@@ -59,17 +51,6 @@ def prompt() -> np.ndarray:
 def noise(shape: tuple[int, ...]) -> torch.Tensor:
     """What the start of the flow is noised with."""
     return torch.from_numpy(draw("noise", shape))
-
-
-def stub_xformers() -> None:
-    """``xformers.ops.memory_efficient_attention`` by definition; without it their code scales otherwise."""
-    ops = types.ModuleType("xformers.ops")
-    ops.memory_efficient_attention = lambda q, k, v, attn_bias=None, op=None: (
-        torch.nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=attn_bias)
-    )
-    package = types.ModuleType("xformers")
-    package.ops, package.__spec__ = ops, ModuleSpec("xformers", None)
-    sys.modules |= {"xformers": package, "xformers.ops": ops}
 
 
 def make_model():
@@ -94,9 +75,9 @@ def make_model():
     return model.eval()
 
 
-def run_authors() -> dict[str, np.ndarray]:
+def run_authors(folder: Path) -> dict[str, np.ndarray]:
     """Start of the flow, network output, its end, unclipped decode and final maps of one and two members."""
-    stub_xformers()
+    authors.install(authors.XFORMERS)  # without it their code scales otherwise
     model = make_model()
     image = torch.from_numpy(image_u8()).permute(2, 0, 1)[None] / 127.5 - 1
     torch.randn_like = lambda x: noise(tuple(x.shape))
@@ -126,18 +107,5 @@ def run_authors() -> dict[str, np.ndarray]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--authors", type=Path, required=True, help="checkout of CompVis/depth-fm")
-    parser.add_argument("--out", type=Path, required=True)
-    arguments = parser.parse_args()
-    sys.path.insert(0, str(arguments.authors))
-    kept = run_authors()
-    np.savez_compressed(arguments.out, **kept)
-    for name, value in kept.items():
-        if value.dtype == np.float32:
-            print(name, value.shape, float(value.min()), float(value.max()))
-
-
 if __name__ == "__main__":
-    main()
+    authors.write_fixture(run_authors)

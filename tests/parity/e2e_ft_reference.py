@@ -9,58 +9,28 @@ The configurations below are what the parity test builds our pipeline from. Thei
 copied; torchvision, which it imports for two functions, is replaced by what they do.
 """
 
-import argparse
-import sys
+import string
 import tempfile
-from enum import Enum
 from pathlib import Path
 
 import numpy as np
 
-from tests.parity import stub_modules, tiny_configs
-from tests.parity.geowizard_reference import TEXT, VAE, write_tokenizer
+from tests.parity import authors
+from tests.parity.authors import TEXT, VAE
 
-UNET = tiny_configs.UNET | {"in_channels": 8}
-SCHEDULER = tiny_configs.SCHEDULER | {"timestep_spacing": "trailing"}
+UNET = authors.UNET | {"in_channels": 8}
+SCHEDULER = authors.SCHEDULER | {"timestep_spacing": "trailing"}
 SIZE = (48, 64)
 
 
 def image_u8() -> np.ndarray:
     """``(H, W, 3)`` uint8."""
-    from tests.parity.named_weights import draw
-
-    return np.clip(draw("e2e-ft/image", (*SIZE, 3)) * 60 + 128, 0, 255).astype(np.uint8)
+    return authors.picture("e2e-ft/image", SIZE)
 
 
-def _stand_in() -> None:
-    import torch
-
-    def pil_to_tensor(image):
-        return torch.from_numpy(np.array(image)).permute(2, 0, 1)
-
-    class InterpolationMode(Enum):
-        BILINEAR, BICUBIC, NEAREST_EXACT = "bilinear", "bicubic", "nearest-exact"
-
-    contents = {
-        "torchvision": {},
-        "torchvision.transforms": {"InterpolationMode": InterpolationMode},
-        "torchvision.transforms.functional": {
-            "InterpolationMode": InterpolationMode,
-            "pil_to_tensor": pil_to_tensor,
-            "resize": None,  # nothing is resized here
-        },
-    }
-    stub_modules.install(contents)
-
-
-def main() -> None:
-    """Write the slices."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--authors", required=True, help="folder Marigold/ of their repository")
-    parser.add_argument("--out", required=True)
-    arguments = parser.parse_args()
-    sys.path.insert(0, arguments.authors)
-    _stand_in()
+def run_authors(folder: Path) -> dict[str, np.ndarray]:
+    """Network output, latent, unclipped decode and final map of their pipeline."""
+    authors.install(authors.TORCHVISION)
     from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
     from marigold.marigold_pipeline import MarigoldPipeline
     from PIL import Image
@@ -69,9 +39,8 @@ def main() -> None:
     from tests.parity.named_weights import fill
 
     text_encoder = CLIPTextModel(CLIPTextConfig(**TEXT))
-    with tempfile.TemporaryDirectory() as folder:
-        write_tokenizer(Path(folder))
-        tokenizer = CLIPTokenizer(f"{folder}/vocab.json", f"{folder}/merges.txt")
+    with tempfile.TemporaryDirectory() as name:
+        tokenizer = CLIPTokenizer(*authors.write_tokenizer(name, string.ascii_lowercase))
     pipe = MarigoldPipeline(
         unet=fill(UNet2DConditionModel(**UNET), "unet."),
         vae=fill(AutoencoderKL(**VAE), "vae."),
@@ -99,14 +68,13 @@ def main() -> None:
         noise="zeros",
     )
     latent, unclipped = decoded[0]
-    kept = {
+    return {
         "network_output": outputs[0].numpy(),
         "latent": latent.numpy(),
         "unclipped": unclipped[0, 0].numpy()[::4, ::4],  # about [-1, 1]
         "depth": out.depth_np[::4, ::4],  # min-max of the clipped map
     }
-    np.savez_compressed(arguments.out, **{name: x.astype(np.float32) for name, x in kept.items()})
 
 
 if __name__ == "__main__":
-    main()
+    authors.write_fixture(run_authors)

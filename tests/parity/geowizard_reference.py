@@ -9,23 +9,18 @@ The configurations below are what the parity test builds our pipeline from. Thei
 copied; torchvision's resize and xformers' attention are replaced by the torch functions they wrap.
 """
 
-import argparse
-import json
-import sys
+import string
 import tempfile
-from enum import Enum
 from pathlib import Path
 
 import numpy as np
 
-from tests.parity import stub_modules, tiny_configs
+from tests.parity import authors
+from tests.parity.authors import ENCODER, SCHEDULER, TEXT, VAE
+from tests.parity.named_weights import draw, fill
 
-UNET = tiny_configs.UNET | {"in_channels": 8, "class_embed_type": "projection"}
-VAE = tiny_configs.VAE
-SCHEDULER = tiny_configs.SCHEDULER
-ENCODER = {"hidden_size": 8, "intermediate_size": 16, "num_attention_heads": 2, "num_hidden_layers": 2}
+UNET = authors.UNET | {"in_channels": 8, "class_embed_type": "projection"}
 VISION = ENCODER | {"image_size": 32, "patch_size": 8, "projection_dim": 8}
-TEXT = ENCODER | {"vocab_size": 54, "bos_token_id": 0, "eos_token_id": 1, "pad_token_id": 1}
 CROP = {"height": 32, "width": 32}
 STEPS = 10
 SIZE = (48, 64)
@@ -33,50 +28,14 @@ SIZE = (48, 64)
 CASES = {"v1_indoor": (10, "indoor"), "v1_object": (10, "object"), "v2_outdoor": (4, "outdoor")}
 
 
-def write_tokenizer(folder: Path) -> Path:
-    """A tokenizer that knows the lower-case letters and no merges."""
-    letters = [chr(c) for c in range(ord("a"), ord("z") + 1)]
-    tokens = ["<|startoftext|>", "<|endoftext|>", *letters, *(letter + "</w>" for letter in letters)]
-    (folder / "vocab.json").write_text(json.dumps({token: i for i, token in enumerate(tokens)}))
-    (folder / "merges.txt").write_text("#version: 0.2\n")
-    return folder
-
-
 def image_u8() -> np.ndarray:
     """``(H, W, 3)`` uint8."""
-    from tests.parity.named_weights import draw
-
-    return np.clip(draw("geowizard/image", (*SIZE, 3)) * 60 + 128, 0, 255).astype(np.uint8)
+    return authors.picture("geowizard/image", SIZE)
 
 
 def noise() -> np.ndarray:
     """``(1, 4, h, w)``, what both halves start from."""
-    from tests.parity.named_weights import draw
-
     return draw("geowizard/noise", (1, 4, SIZE[0] // 8, SIZE[1] // 8))
-
-
-def _stand_ins() -> None:
-    """torchvision's resize and xformers' attention as the torch functions that they wrap."""
-    import torch.nn.functional as F
-
-    class InterpolationMode(Enum):
-        BICUBIC = "bicubic"
-
-    def resize(img, size, interpolation, antialias):
-        return F.interpolate(img, size, mode=interpolation.value, align_corners=False, antialias=antialias)
-
-    def attention(query, key, value, attn_bias=None):
-        return F.scaled_dot_product_attention(query, key, value, attn_mask=attn_bias)
-
-    contents = {
-        "torchvision": {},
-        "torchvision.transforms": {"InterpolationMode": InterpolationMode},
-        "torchvision.transforms.functional": {"resize": resize},
-        "xformers": {},
-        "xformers.ops": {"memory_efficient_attention": attention},
-    }
-    stub_modules.install(contents)
 
 
 def run_case(case: str, coupled: bool) -> dict[str, np.ndarray]:
@@ -96,8 +55,6 @@ def run_case(case: str, coupled: bool) -> dict[str, np.ndarray]:
         CLIPVisionModelWithProjection,
     )
 
-    from tests.parity.named_weights import fill
-
     width, domain = CASES[case]
     parts = {
         "unet": fill(UNet2DConditionModel(**UNET, projection_class_embeddings_input_dim=width), "unet."),
@@ -115,8 +72,8 @@ def run_case(case: str, coupled: bool) -> dict[str, np.ndarray]:
             encoder, "text_encoder.", rename=lambda name: name.removeprefix("text_model.")
         )
         with tempfile.TemporaryDirectory() as folder:
-            write_tokenizer(Path(folder))
-            parts["tokenizer"] = CLIPTokenizer(f"{folder}/vocab.json", f"{folder}/merges.txt")
+            files = authors.write_tokenizer(folder, string.ascii_lowercase)
+            parts["tokenizer"] = CLIPTokenizer(*files)
         pipe = geowizard_v2_pipeline.DepthNormalEstimationPipeline(**parts)
     if coupled:  # theirs refuses to without CUDA, and run_infer.py swallows that
         for module in pipe.unet.modules():
@@ -161,18 +118,12 @@ def run_case(case: str, coupled: bool) -> dict[str, np.ndarray]:
     }
 
 
-def main() -> None:
-    """Write the slices of every case, and the output without the cross-domain attention of one."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--authors", required=True, help="folder geowizard/ of their repository")
-    parser.add_argument("--out", required=True)
-    arguments = parser.parse_args()
-    sys.path.insert(0, arguments.authors)
-    _stand_ins()
+def run_authors(folder: Path) -> dict[str, np.ndarray]:
+    """The slices of every case, and the output without the cross-domain attention of one."""
+    authors.install(authors.TORCHVISION | authors.XFORMERS)
     found = {f"{case}/{name}": x for case in CASES for name, x in run_case(case, coupled=True).items()}
-    found["uncoupled/network_output"] = run_case("v1_indoor", coupled=False)["network_output"]
-    np.savez_compressed(arguments.out, **{name: x.astype(np.float32) for name, x in found.items()})
+    return found | {"uncoupled/network_output": run_case("v1_indoor", coupled=False)["network_output"]}
 
 
 if __name__ == "__main__":
-    main()
+    authors.write_fixture(run_authors)

@@ -8,30 +8,18 @@ The configurations below are what the parity test builds our pipeline from. Thei
 copied; of torchvision it needs one function, given here as the torch function that it wraps.
 """
 
-import argparse
-import json
-import sys
 import tempfile
-from enum import Enum
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from tests.parity import stub_modules, tiny_configs
+from tests.parity import authors
+from tests.parity.authors import TEXT_1 as TEXT
+from tests.parity.authors import VAE
+from tests.parity.named_weights import draw, fill
 
-UNET = tiny_configs.UNET | {"class_embed_type": "projection", "projection_class_embeddings_input_dim": 4}
-VAE = tiny_configs.VAE
-TEXT = {
-    "hidden_size": 8,
-    "intermediate_size": 16,
-    "num_attention_heads": 2,
-    "num_hidden_layers": 2,
-    "vocab_size": 4,
-    "bos_token_id": 0,
-    "eos_token_id": 1,
-    "pad_token_id": 1,
-}
-VOCABULARY = {"<|startoftext|>": 0, "<|endoftext|>": 1, "a</w>": 2, "a": 3}
+UNET = authors.UNET | {"class_embed_type": "projection", "projection_class_embeddings_input_dim": 4}
 #: case -> (input channels of the U-Net, image size, processing resolution)
 CASES = {
     "g": (8, (48, 64), 0),
@@ -42,13 +30,6 @@ CASES = {
 }
 
 
-def write_tokenizer(folder: Path) -> tuple[str, str]:
-    """A tokenizer that knows one letter; the files that ``CLIPTokenizer`` wants to be told."""
-    (folder / "vocab.json").write_text(json.dumps(VOCABULARY))
-    (folder / "merges.txt").write_text("#version: 0.2\n")
-    return str(folder / "vocab.json"), str(folder / "merges.txt")
-
-
 def loud(vae):
     """That VAE with a last layer that leaves [-1, 1] in places, where it matters who clips what."""
     vae.decoder.conv_out.weight.data *= 4.0
@@ -57,15 +38,11 @@ def loud(vae):
 
 def image_u8(case: str) -> np.ndarray:
     """``(H, W, 3)`` uint8."""
-    from tests.parity.named_weights import draw
-
-    return np.clip(draw(f"lotus/{case}/image", (*CASES[case][1], 3)) * 60 + 128, 0, 255).astype(np.uint8)
+    return authors.picture(f"lotus/{case}/image", CASES[case][1])
 
 
 def drawn(case: str, what: str, shape: tuple[int, ...]) -> np.ndarray:
     """``"noise"`` of the start or ``"posterior"`` draw, of that shape."""
-    from tests.parity.named_weights import draw
-
     return draw(f"lotus/{case}/{what}", shape)
 
 
@@ -74,43 +51,16 @@ def keep(x: np.ndarray) -> np.ndarray:
     return x[..., ::5, ::5]
 
 
-def _stand_ins() -> None:
-    """torchvision's resize, and empty modules for what is imported only."""
-    import torch.nn.functional as F
-
-    class InterpolationMode(Enum):
-        NEAREST_EXACT = "nearest-exact"
-        BILINEAR = "bilinear"
-        BICUBIC = "bicubic"
-
-    def resize(img, size, interpolation, antialias):
-        smooth = interpolation is not InterpolationMode.NEAREST_EXACT
-        flags = {"align_corners": False, "antialias": antialias} if smooth else {}
-        return F.interpolate(img, size, mode=interpolation.value, **flags)
-
-    contents = {
-        "torchvision": {},
-        "torchvision.transforms": {"InterpolationMode": InterpolationMode},
-        "torchvision.transforms.functional": {"resize": resize},
-        "tensorboard": {},
-        "matplotlib": {},
-    }
-    stub_modules.install(contents)
-
-
 def run_case(case: str) -> dict[str, np.ndarray]:
     """One call as in ``infer.py``: inputs and outputs of the network, unclipped decode, final output."""
-    import torch
     from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
     from diffusers.models.autoencoders import vae as vae_module
     from pipeline import LotusDPipeline, LotusGPipeline
     from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
-    from tests.parity.named_weights import fill
-
     channels, _, resolution = CASES[case]
     with tempfile.TemporaryDirectory() as folder:
-        tokenizer = CLIPTokenizer(*write_tokenizer(Path(folder)), model_max_length=77)
+        tokenizer = CLIPTokenizer(*authors.write_tokenizer(folder, "a"), model_max_length=77)
     text_encoder = CLIPTextModel(CLIPTextConfig(**TEXT))
     pipe = {8: LotusGPipeline, 4: LotusDPipeline}[channels](
         unet=fill(UNet2DConditionModel(**UNET, in_channels=channels), "unet."),
@@ -166,17 +116,11 @@ def run_case(case: str) -> dict[str, np.ndarray]:
     }
 
 
-def main() -> None:
-    """Write the slices of every case."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--authors", required=True, help="a checkout of their repository")
-    parser.add_argument("--out", required=True)
-    arguments = parser.parse_args()
-    sys.path.insert(0, arguments.authors)
-    _stand_ins()
-    found = {f"{case}/{name}": x for case in CASES for name, x in run_case(case).items()}
-    np.savez_compressed(arguments.out, **{name: x.astype(np.float32) for name, x in found.items()})
+def run_authors(folder: Path) -> dict[str, np.ndarray]:
+    """The slices of every case."""
+    authors.install(authors.TORCHVISION | {"tensorboard": {}, "matplotlib": {}})
+    return {f"{case}/{name}": x for case in CASES for name, x in run_case(case).items()}
 
 
 if __name__ == "__main__":
-    main()
+    authors.write_fixture(run_authors)

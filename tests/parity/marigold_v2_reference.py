@@ -9,9 +9,7 @@ Their graph of one step is imported, not copied; their registry is replaced by a
 on by peft with their list of targets, and weights are loaded as they load them: not strictly.
 """
 
-import argparse
 import importlib.util
-import sys
 import tempfile
 import types
 from pathlib import Path
@@ -20,6 +18,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
+from tests.parity import authors
 from tests.parity.named_weights import draw, named_state
 
 TRANSFORMER = {
@@ -121,16 +120,15 @@ class _Torch(types.ModuleType):
         return getattr(torch, name)
 
 
-def authors_graph(authors: Path, embed_dir: str, components: dict) -> types.ModuleType:
+def authors_graph(folder: Path, embed_dir: str, components: dict) -> types.ModuleType:
     """Their module, with a registry that holds these components."""
-    registry = types.ModuleType("marigoldv2.core.registry")
-    registry.REGISTRY = {"cfg": SimpleNamespace(paths=SimpleNamespace(embed_dir=embed_dir))}
-    registry.get = lambda kind, name: components[name]
-    registry.register = lambda kind: lambda cls: cls
-    for name in ("marigoldv2", "marigoldv2.core"):
-        sys.modules[name] = types.ModuleType(name)
-    sys.modules["marigoldv2.core.registry"] = registry
-    path = authors / "marigoldv2/experiments/20260316_qwen_depth/network_graph.py"
+    registry = {
+        "REGISTRY": {"cfg": SimpleNamespace(paths=SimpleNamespace(embed_dir=embed_dir))},
+        "get": lambda kind, name: components[name],
+        "register": lambda kind: lambda cls: cls,
+    }
+    authors.install({"marigoldv2": {}, "marigoldv2.core": {}, "marigoldv2.core.registry": registry})
+    path = folder / "marigoldv2/experiments/20260316_qwen_depth/network_graph.py"
     spec = importlib.util.spec_from_file_location("network_graph", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -157,7 +155,7 @@ def load_theirs(name: str, dtype: torch.dtype) -> dict:
 
 
 @torch.no_grad()
-def run_case(authors: Path, name: str, dtype: torch.dtype, drawn: float) -> dict[str, np.ndarray]:
+def run_case(checkout: Path, name: str, dtype: torch.dtype, drawn: float) -> dict[str, np.ndarray]:
     """Latents before and after the step, decoded map before and after its clamp; 0 drawn is the mode."""
     from diffusers.models.autoencoders import vae as vae_module
 
@@ -166,7 +164,7 @@ def run_case(authors: Path, name: str, dtype: torch.dtype, drawn: float) -> dict
         embedding, mask = prompts()
         torch.save(embedding, Path(folder) / f"{PREFIX}_prompt_embeds.pt")
         torch.save(mask, Path(folder) / f"{PREFIX}_prompt_mask.pt")
-        graph = authors_graph(authors, folder, parts)
+        graph = authors_graph(checkout, folder, parts)
         if dtype == torch.float32:
             graph.torch = _Torch("torch")
         step = graph.QwenImageEdit2509Step({"prefix": PREFIX})
@@ -191,22 +189,15 @@ def run_case(authors: Path, name: str, dtype: torch.dtype, drawn: float) -> dict
     }
 
 
-def main() -> None:
-    """Write the slices of every checkpoint in float32, and of one in bfloat16, which they ran in."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--authors", required=True, type=Path, help="a checkout of their repository")
-    parser.add_argument("--out", required=True, type=Path)
-    arguments = parser.parse_args()
+def run_authors(folder: Path) -> dict[str, np.ndarray]:
+    """The slices of every checkpoint in float32, and of one in bfloat16, which they ran in."""
     runs = [(name, name, torch.float32, 1.0) for name in CHECKPOINTS]
     runs.append(("mode", "Log-stage2", torch.float32, 0.0))
     runs.append(("bfloat16", "Log-stage2", torch.bfloat16, 0.0))
-    found = {
-        f"{label}/{key}": value
-        for label, *case in runs
-        for key, value in run_case(arguments.authors, *case).items()
+    return {
+        f"{label}/{key}": value for label, *case in runs for key, value in run_case(folder, *case).items()
     }
-    np.savez_compressed(arguments.out, **found)
 
 
 if __name__ == "__main__":
-    main()
+    authors.write_fixture(run_authors)

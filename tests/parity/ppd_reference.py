@@ -8,15 +8,13 @@ Their networks, sampler and resizing are imported, not copied; torchvision, timm
 empty modules, since nothing of them is called here but a helper that makes a pair of a number.
 """
 
-import argparse
-import sys
-import types
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from tests.parity import authors
 from tests.parity.named_weights import draw, named_state
 
 #: A small DiT; the width of the semantic tokens, 1024, is fixed in their code.
@@ -101,51 +99,41 @@ def authors_model() -> torch.nn.Module:
     return model.eval()
 
 
-def stub_modules() -> None:
-    """Empty modules in the place of what their files import on the way."""
-    names = {
-        "torchvision.transforms": {"Compose": None},
-        "timm.layers.grn": {"GlobalResponseNorm": None},
-        "timm.layers.helpers": {"to_2tuple": lambda x: x if isinstance(x, tuple) else (x, x)},
-        "omegaconf": {"DictConfig": dict},
-    }
-    for path, attributes in names.items():
-        for end in range(1, path.count(".") + 2):
-            name = ".".join(path.split(".")[:end])
-            sys.modules.setdefault(name, types.ModuleType(name))
-        vars(sys.modules[path]).update(attributes)
+#: In the place of what their files import on the way.
+STAND_INS = {
+    "torchvision": {},
+    "torchvision.transforms": {"Compose": None},
+    "timm": {},
+    "timm.layers": {},
+    "timm.layers.grn": {"GlobalResponseNorm": None},
+    "timm.layers.helpers": {"to_2tuple": lambda x: x if isinstance(x, tuple) else (x, x)},
+    "omegaconf": {"DictConfig": dict},
+}
 
 
-def main(authors: Path, out: Path) -> None:
-    """Run theirs and save ``out``."""
-    sys.path.insert(0, str(authors))
-    stub_modules()
+@torch.no_grad()
+def run_authors(folder: Path) -> dict[str, np.ndarray]:
+    """Slices of networks, sampler and resizing."""
+    authors.install(STAND_INS)
     from ppd.utils.diffusion.timesteps import Timesteps
     from ppd.utils.transform import image2tensor, resize_keep_aspect
 
     model, kept = authors_model(), {}
-    with torch.no_grad():
-        semantics = model.semantics_prompt(picture())
-        joined = torch.cat([noise(), picture() - 0.5], dim=1)
-        kept["semantics"] = semantics[:, :, ::64].numpy()
-        kept["velocity"] = corners(model.dit(x=joined, semantics=semantics, timestep=torch.tensor(MIDDLE)))
-        drawn, torch.randn = torch.randn, lambda size: noise()
-        kept["final"] = corners(model.forward_test(picture()))
-        torch.randn = drawn
+    semantics = model.semantics_prompt(picture())
+    joined = torch.cat([noise(), picture() - 0.5], dim=1)
+    kept["semantics"] = semantics[:, :, ::64].numpy()
+    kept["velocity"] = corners(model.dit(x=joined, semantics=semantics, timestep=torch.tensor(MIDDLE)))
+    drawn, torch.randn = torch.randn, lambda size: noise()
+    kept["final"] = corners(model.forward_test(picture()))
+    torch.randn = drawn
     for count in COUNTS:
         kept[f"timesteps_{count}"] = Timesteps(1000, count).timesteps.numpy()
     for kind in PHOTOGRAPHS:
         resized = image2tensor(resize_keep_aspect(photograph(kind)[:, :, ::-1].copy()))
         kept[f"{kind}_size"] = np.array(resized.shape[-2:])
         kept[kind] = resized[:, :, ::97, ::97].numpy()
-    np.savez_compressed(out, **kept)
+    return kept
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--authors", type=Path, required=True, help="checkout of gangweix/pixel-perfect-depth"
-    )
-    parser.add_argument("--out", type=Path, required=True)
-    arguments = parser.parse_args()
-    main(arguments.authors, arguments.out)
+    authors.write_fixture(run_authors)
