@@ -75,7 +75,7 @@ def run_sequence(name: str, options: SequenceOptions) -> Page | None:
     cells = []
     for seed, way in product(range(options.scenes), options.ways):
         how = (options.frames, *options.size, options.steps, options.seed, settings.device)
-        key = "|".join(map(str, (seed, way, *how, settings.prior, prior, __version__)))
+        key = fingerprint(seed, way, *how, settings.prior, prior, __version__)
         work = partial(_measure_sequence, pipe, render, seed, way, options, store)
         cells.append(Item(key, work, name=f"sequence {seed}, {way}", head={"seed": seed, "way": way}))
     of = f"{options.frames} frames, {options.size[1]}x{options.size[0]} pixels, prior {settings.prior}"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -308,10 +309,9 @@ def find_mvsnet(root: Path, pairs: str = "default", pixel_centre: float = 0.0) -
     """
     refs = []
     for group, sources in _groups(root, pairs, benchmark=False):
+        chosen = [sorted({*sources, *chain(*sources.values())})]
         if pairs == "all":
             chosen = [[i, j, *sources[i]] for i in sources for j in sources[i]]
-        else:
-            chosen = [sorted({*sources, *(view for listed in sources.values() for view in listed)})]
         for views in (views for views in chosen if len(views) > 1):
             name = group.name if pairs == "default" else f"{group.name}-{views[0]}-{views[1]}"
             truth = group / "depths" / f"{views[0]:08d}.pfm"
