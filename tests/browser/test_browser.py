@@ -123,19 +123,6 @@ def test_a_result_is_judged_stale_after_a_change_and_gone_under_an_error(visitor
     assert page.locator("#measure-picture img").count() == 0 and page.locator(".verdict").count() == 0
 
 
-def test_an_example_sets_every_field_and_runs(visitor):
-    page = visitor()
-    page.get_by_text("Focal length and baseline").click()
-    field(page, "baseline").fill("0.5")
-    page.locator("#examples button").nth(1).click()
-    page.wait_for_selector("#status .figures", timeout=RUN_MS)
-    assert field(page, "baseline").input_value() == ""
-    assert page.locator("#way input:checked").get_attribute("value") == "file"
-    assert "0.06 m away, right" in page.locator("#status .cameras").inner_text()
-    page.wait_for_timeout(500)
-    assert not is_stale(page)
-
-
 def test_two_visitors_at_once_do_not_mix(visitor, plane_files, tmp_path):
     pages = {0.12: visitor(), 0.24: visitor()}
     for baseline_m, page in pages.items():

@@ -77,6 +77,7 @@ FILES: dict[str, Any] = {
     "texts/a.md": "",
     "one/report.json": "{}",
     "mine/pairs.csv": "left.png,right.png\n",
+    "drive.mcap": b"\0" * 99,
     # other commands
     "map.npy": MAP,
     "small.npy": MAP[:4, :4],

@@ -44,20 +44,6 @@ def test_a_bag_becomes_a_bag_and_goes_on(geodiff, prior, textured_plane, tmp_pat
         np.testing.assert_array_equal(first, second)
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["drive.mcap", "--left", "/cam0/image_rect", "--out", "d.mcap"], "--right must be given as a topic"),
-        (["drive.mcap", *TOPICS, "--out", "folder"], "--out must be a file that ends in .mcap or .bag"),
-        (["left.png", "right.png", *TOPICS], "--left must be left out where LEFT is no bag"),
-    ],
-)
-def test_refusals(geodiff, pair_files, words, said) -> None:
-    (pair_files.folder / "drive.mcap").write_bytes(b"\0" * 99)
-    answer = geodiff("depth", *words)
-    assert answer.code == 2 and said in answer.err
-
-
 FILES = {
     "middlebury": ("trainingH/Plane/disp0Ours.pfm", "trainingH/Plane/timeOurs.txt"),
     "eth3d": ("low_res_two_view/Plane.pfm", "low_res_two_view/Plane.txt"),

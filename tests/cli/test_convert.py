@@ -105,15 +105,6 @@ def test_checkpoints_that_do_not_fit(convert, checkpoint, content, parts, tmp_pa
     refused(answer, tmp_path, {"weights.ckpt"}, *parts)
 
 
-def test_a_vae_that_is_not_there_and_a_torn_file(convert, geodiff, checkpoint, tmp_path):
-    refused(
-        convert(checkpoint, "--with", tmp_path / "sd"), tmp_path, {"weights.ckpt"}, "Stable Diffusion 1.5"
-    )
-    (tmp_path / "weights.ckpt").write_bytes(b"PK\x03\x04 torn")
-    answer = geodiff("convert", tmp_path / "weights.ckpt", tmp_path / "out")
-    refused(answer, tmp_path, {"weights.ckpt"}, "written by torch.save")
-
-
 # Folders of .bin files -----------------------------------------------------------------------------------
 
 

@@ -5,8 +5,6 @@ import errno
 import json
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -266,22 +264,3 @@ def test_the_video_of_a_rig(geodiff, fresh, views, beside):
 
 
 # Several processes
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["torchrun", "two terminals"])
-def test_two_processes_share_the_pairs(fresh, launcher):
-    torchrun = [*("torch.distributed.run", "--nproc-per-node", "2", "--rdzv-backend", "c10d")]
-    torchrun += ["--rdzv-endpoint", "localhost:0", "-m"]
-    words = [sys.executable, "-m", *(torchrun if launcher == "torchrun" else ()), "geodiff_plugin", *COMMAND]
-    package = Path(__file__).resolve().parents[2]
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(package)}
-    started = [
-        subprocess.Popen(words, cwd=fresh, env=environment, text=True, stdout=-1, stderr=-1)
-        for _ in range(1 if launcher == "torchrun" else 2)
-    ]
-    for process in started:
-        out, err = process.communicate(timeout=300)
-        assert process.returncode == 0, err
-        assert "3 pairs: " in out and ", 0 failed" in out and out.count("pairs:") == 1
-    assert {row["result"] for row in rows_of()} <= {"done", "there"}

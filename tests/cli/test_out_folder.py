@@ -39,18 +39,6 @@ def refused(path: Path, **options) -> str:
     return str(caught.value)
 
 
-def test_a_new_folder_appears_whole(tmp_path):
-    out = tmp_path / "deep" / "er" / "out"
-
-    def watched(folder):
-        assert not out.exists()
-        return fill(folder)
-
-    with OutFolder(out) as held:
-        assert held.write(watched) == "filled" and held.path == out
-    assert [path.name for path in sorted(tmp_path.rglob("*"))] == ["deep", "er", "out", *WRITTEN]
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(errno.ENOSPC, "No space left on device")])
 @pytest.mark.parametrize("exists", [True, False])
 def test_what_ends_amid_the_writing_loses_nothing_and_strews_nothing(tmp_path, error, exists):

@@ -192,19 +192,6 @@ def test_eval_capture_measures_every_row(tmp_path, monkeypatch):
     assert COMMANDS["capture"]("capture", again).tables[0].rows == table.rows[1:]
 
 
-def test_frames_are_chosen_by_name_and_by_number_and_options_checked(tmp_path):
-    capture = Capture.open(write_transforms(tmp_path, TRUE[:6], TRUE[:6]))
-    assert capture.choose(None) == [f"f{i:02d}" for i in range(6)]
-    assert capture.choose("1:5:2") == ["f01", "f03", "f05"] and capture.choose("f02, f00") == ["f02", "f00"]
-    for text in ("f09", "a:b", "7:9"):
-        with pytest.raises(InputError):
-            capture.choose(text)
-    two_ways = {"known_length": "a:1,1,9,9,1", "metres_per_unit": 1.0}
-    for wrong in ({"neighbours": 0}, {"poses": "best"}, {"export": ("obj",)}, two_ways):
-        with pytest.raises(InputError):
-            CaptureOptions(path=".", **wrong)
-
-
 HALVED = TRUE.copy()
 HALVED[:, :3, 3] /= 2
 

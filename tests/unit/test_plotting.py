@@ -27,14 +27,6 @@ def test_near_is_yellow_far_is_blue_unknown_is_grey():
     assert (np.diff(lightness) <= 1).all() and lightness[0] - lightness[-1] > 180
 
 
-def test_percentiles_ignore_invalid_and_outliers():
-    depth = np.linspace(2.0, 3.0, 1000).reshape(10, 100)
-    depth[0, 0], depth[0, 1] = 1e6, np.inf
-    near, far = depth_range(depth)
-    assert 2.0 < near < 2.05 and 2.95 < far < 3.05
-    assert depth_range(depth, near=1.0) == (1.0, far)
-
-
 RISING = np.linspace(2.0, 3.0, 100).reshape(10, 10)
 
 
