@@ -210,18 +210,15 @@ def test_points_take_the_place_of_matches_of_less_confidence() -> None:
     assert torch.equal(with_points(None, points).inverse_depth, points.inverse_depth)
 
 
-@pytest.mark.parametrize(
-    ("confidence", "said"),
-    [
+def test_what_is_no_confidence():
+    for confidence, said in (
         (np.ones((3, 4)), r"must be of shape \(48, 64\), as the points; got shape \(3, 4\)"),
         (np.full(SIZE, 100), r"points_confidence must be in \[0, 1\]; got values from 100 to 100"),
         ("high", "points_confidence must be numbers"),
         (np.zeros(SIZE), "at least one of them known"),
-    ],
-)
-def test_what_is_no_confidence(confidence, said) -> None:
-    with pytest.raises(InputError, match=said):
-        GeometryGuidance.from_points(np.ones(SIZE, np.float32), K, points_confidence=confidence)
+    ):
+        with pytest.raises(InputError, match=said):
+            GeometryGuidance.from_points(np.ones(SIZE, np.float32), K, points_confidence=confidence)
 
 
 def test_disparities_of_any_size_become_depths(tmp_path) -> None:

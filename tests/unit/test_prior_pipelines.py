@@ -153,9 +153,7 @@ def test_folders_as_lotus_authors_wrote_them(kind, tmp_path):
 
 
 def test_the_name_of_a_lotus_tells_its_space():
-    assert (
-        space_of_name("jingheya/lotus-depth-d-v1-0") == space_of_name("/disparity/lotus-depth-d") == "depth"
-    )
+    assert space_of_name("hub/lotus-depth-d-v1-0") == space_of_name("/disparity/lotus-depth-d") == "depth"
     assert space_of_name("models--jingheya--lotus-depth-g-v2-1-disparity/snapshots/1a2b") == "disparity"
     for name in ("checkpoints/lotus", "some-disparity-model"):
         with pytest.raises(ValueError, match="--space"):
