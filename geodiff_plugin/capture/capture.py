@@ -200,7 +200,7 @@ class Capture:
         if points == "none":
             return None
         if self.unit is None:
-            cure = "Give --metres-per-unit or --known-length."
+            cure = "Give --metres-per-unit, --known-length or --distance."
             bad_value("points", "of a capture whose scale is known", "one without a unit", cure)
         if points == "depth":
             depth_m, known = self.measured_depth(name)

@@ -51,6 +51,7 @@ class CaptureOptions(PriorOptions):
     known_length: str | None = declare(
         None, "A distance in the scene, NAME:X1,Y1,X2,Y2,METRES by pixels of a frame.", panel=CAMERAS
     )
+    distance: str | None = declare(None, "Distance of two cameras, NAME,NAME,METRES.", panel=CAMERAS)
     k: Path | None = declare(None, "3x3 intrinsics, text or .npy.", "--K", panel=CAMERAS)
     fov: float | None = declare(None, "Horizontal field of view, degrees.", panel=CAMERAS)
     trajectory: Path | None = declare(
@@ -64,9 +65,9 @@ class CaptureOptions(PriorOptions):
     )
     export: tuple[str, ...] = declare(
         (),
-        "colmap: images, poses and points as a model of COLMAP.",
+        "colmap: a dense workspace; mesh: by TSDF (extra mesh); repeatable.",
         panel=OUTPUT,
-        choices=("colmap",),
+        choices=("colmap", "mesh"),
     )
     overwrite: bool = declare(
         False, "Write into a folder that holds files; do finished frames anew.", panel=OUTPUT
@@ -76,8 +77,11 @@ class CaptureOptions(PriorOptions):
 
     def __post_init__(self) -> None:
         check_options(self)
-        if self.metres_per_unit is not None and self.known_length is not None:
-            bad_value("the scale", "given in one way", "both --metres-per-unit and --known-length")
+        ways = [self.metres_per_unit, self.known_length, self.distance]
+        if sum(way is not None for way in ways) > 1:
+            bad_value(
+                "the scale", "given in one way", "more of --metres-per-unit, --known-length, --distance"
+            )
 
     def key(self, names: Sequence[str], *of: str) -> str:
         """A digest of the settings ``of`` and the frames that a result depends on."""

@@ -1,4 +1,4 @@
-"""What a run leaves behind its frames: depth agreed between them, one cloud, a sheet, a model of COLMAP."""
+"""What a run leaves behind its frames: agreed depth, one cloud, a mesh, a sheet, a workspace of COLMAP."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.capture.agreement import DepthFrame, agreed
 from geodiff_plugin.capture.capture import Capture, choose_neighbours
 from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb, write_vertices
@@ -30,6 +31,8 @@ OTHERS, ON_SHEET, GLB_POINTS = 6, 24, 400_000
 CELL_SHARE, LEAST_CONFIDENCE = 0.004, 0.5
 #: Points of one frame at most; more would not show in a cloud of many frames.
 MOST_POINTS = 200_000
+#: A voxel of the mesh as a share of the median depth; voxels along a block's side; blocks to begin with.
+MESH_SHARE, BLOCK, BLOCKS = 0.004, 16, 10_000
 #: Frames after which their points are merged, so that a long capture fits the memory.
 MERGED_AFTER = 20
 #: Columns of the cloud.
@@ -81,6 +84,8 @@ def write_results(capture: Capture, out: Path, names: Sequence[str], export: Seq
     write_vertices(out / "cloud.ply", "world frame", capture.unit, count, VERTEX, [parts])
     cameras = [(f.K, f.E, f.depth.shape[::-1]) for f in map(load, names)]
     write_glb(out / "cloud.glb", cloud.thinned(GLB_POINTS), cameras)
+    if "mesh" in export:
+        write_mesh(out / "mesh.ply", names, load, capture.image)
     if "colmap" in export:
         solved = capture.solve()
         seen = [solved.seen[capture.names.index(name)] for name in names]
@@ -170,19 +175,26 @@ def write_workspace(
     points: np.ndarray,
     seen: Sequence[Observations],
 ) -> None:
-    """Write images and a sparse model of COLMAP, for splatting and dense reconstruction.
+    """Write a dense workspace of COLMAP: images, sparse model, depth (where it is kept) and normal maps.
 
-    ``points (M, 3)`` are those of the poses' solve, ``seen`` where each of the frames sees them.
+    ``points (M, 3)`` are those of the poses' solve, ``seen`` where each of the frames sees them: by
+    what frames share COLMAP chooses pairs.
+
+    Convention:
+        ``colmap stereo_fusion --workspace_path FOLDER --input_type geometric --output_path fused.ply``
     """
-    for name in ("images", "sparse"):
+    for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps", "stereo/consistency_graphs"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    views, colours = [], np.zeros(points.shape, np.uint8)
+    views, maps, colours = [], folder / "stereo", np.zeros(points.shape, np.uint8)
     for frame, observed in zip(frames, seen, strict=True):
         picture = np.rint(image(frame.name) * 255).astype(np.uint8)
         size = picture.shape[1::-1]
         Image.fromarray(picture).save(folder / "images" / f"{frame.name}.png")
         u, v = np.rint(observed.px).astype(int).T.clip(0, np.array(size)[:, None] - 1)
         colours[observed.point] = picture[v, u]
+        depth, file = np.where(kept(frame), frame.depth, 0)[..., None], f"{frame.name}.png.geometric.bin"
+        write_map(maps / "depth_maps" / file, depth)
+        write_map(maps / "normal_maps" / file, normals_of(frame.depth, frame.K))
         views.append((f"{frame.name}.png", frame.K, frame.E, size))
     rows, counts = np.unique(np.concatenate([observed.point for observed in seen]), return_counts=True)
     rows = rows[counts > 1]
@@ -191,3 +203,39 @@ def write_workspace(
     shared = [place[observed.point] >= 0 for observed in seen]
     tracks = [(o.px[both], place[o.point[both]]) for o, both in zip(seen, shared, strict=True)]
     write_colmap(folder / "sparse", views, Cloud(points[rows], colours[rows]), tracks)
+    (maps / "fusion.cfg").write_text("".join(f"{file}\n" for file, *_ in views), encoding="utf-8")
+    pairs = "".join(f"{file}\n__auto__, 20\n" for file, *_ in views)
+    (maps / "patch-match.cfg").write_text(pairs, encoding="utf-8")
+
+
+def write_map(path: Path, values: np.ndarray) -> None:
+    """Write ``(H, W, C)`` floats as COLMAP does: a head ``W&H&C&``, then one channel after the other."""
+    height, width, channels = values.shape
+    data = np.ascontiguousarray(values.transpose(2, 0, 1), dtype="<f4").tobytes()
+    path.write_bytes(f"{width}&{height}&{channels}&".encode() + data)
+
+
+def write_mesh(
+    path: Path, names: Sequence[str], load: Callable[[str], DepthFrame], image: Callable[[str], np.ndarray]
+) -> None:
+    """Write a mesh of all frames by TSDF (extra ``mesh``); ``InputError`` where Open3D is not installed."""
+    try:
+        import open3d
+    except ImportError:
+        bad_value("open3d", "installed for a mesh", "missing", "pip install 'geodiff-plugin[mesh]'")
+    core, tensors = open3d.core, open3d.t.geometry
+    voxel = MESH_SHARE * float(np.median([np.median(load(name).depth) for name in names]))
+    kinds = ("tsdf", "weight", "color"), (core.float32,) * 3, ((1,), (1,), (3,))
+    volume = tensors.VoxelBlockGrid(*kinds, voxel, BLOCK, BLOCKS)
+    for frame in map(load, names):
+        depth = np.where(kept(frame), frame.depth, 0).astype(np.float32)
+        colour = np.ascontiguousarray(image(frame.name), np.float32)
+        maps = [tensors.Image(core.Tensor(values)) for values in (depth[..., None], colour)]
+        K, T = core.Tensor(frame.K.astype(np.float64)), core.Tensor(np.linalg.inv(frame.E))
+        reach = 1.0, float(depth.max()) * 1.01 + voxel
+        blocks = volume.compute_unique_block_coordinates(maps[0], K, T, *reach)
+        volume.integrate(blocks, *maps, K, K, T, *reach)
+    mesh = volume.extract_triangle_mesh(weight_threshold=0.5).to_legacy()
+    mesh.compute_vertex_normals()
+    with atomic_path(path) as temporary:
+        open3d.io.write_triangle_mesh(str(temporary), mesh)

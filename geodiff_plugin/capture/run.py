@@ -39,7 +39,7 @@ Writer = Callable[[Path, MetricDepthOutput, np.ndarray], dict[str, Any]]
 POSES_FILE, SCALE_FILE, JOURNAL, REPORT = "poses.npz", "scale.json", "frames.jsonl", "report.json"
 #: What the poses depend on, and beside them the depth of a frame.
 OF_POSES = ("poses", "k", "fov", "trajectory")
-OF_SCALE = ("metres_per_unit", "known_length")
+OF_SCALE = ("metres_per_unit", "known_length", "distance")
 OF_FRAME = ("neighbours", "points", *OF_SCALE, "prior", "prior_map", "space", "steps", "seed")
 #: Memory that one process of the bundled prior takes at 640x480, bytes; what a larger prior takes is unknown.
 PROCESS_BYTES = 1.5e9
@@ -53,8 +53,7 @@ def open_capture(options: CaptureOptions) -> Capture:
     capture = Capture.open(options.path, K=K, fov=options.fov, trajectory=options.trajectory)
     if options.poses == "given" and capture.poses is None:
         bad_value("--poses given", "used with a capture that has poses", f"{options.path} without")
-    if options.known_length is not None:
-        _length(capture, options.known_length)
+    _length(capture, options)
     return capture
 
 
@@ -99,29 +98,44 @@ def load_solved(path: Path, key: str) -> SolvedCapture | None:
         return None
 
 
-def _length(capture: Capture, typed: str) -> tuple[str, np.ndarray, float]:
-    """Frame of ``--known-length``, its two pixels ``(2, 2)``, and the metres between them."""
-    name, _, rest = typed.rpartition(":")
-    *px, metres = rest.split(",")
-    if len(px) != 4:
-        bad_value("--known-length", "NAME:X1,Y1,X2,Y2,METRES", repr(typed))
+def _length(capture: Capture, options: CaptureOptions) -> tuple[list[str], np.ndarray, float] | None:
+    """Frames of ``--distance``, or frame and two pixels of ``--known-length``, and the metres between."""
+    if options.distance is not None:
+        option, typed, form = "--distance", options.distance, "NAME,NAME,METRES"
+        *names, metres = (word.strip() for word in typed.split(","))
+        px: list[str] = []
+    elif options.known_length is not None:
+        option, typed, form = "--known-length", options.known_length, "NAME:X1,Y1,X2,Y2,METRES"
+        name, _, rest = typed.rpartition(":")
+        names, (*px, metres) = [name], rest.split(",")
+    else:
+        return None
+    if (len(names), len(px)) not in ((2, 0), (1, 4)):
+        bad_value(option, form, repr(typed))
     try:
         *numbers, length = (float(word) for word in (*px, metres))
     except ValueError:
-        bad_value("--known-length", "with numbers", repr(typed))
+        bad_value(option, "with numbers", repr(typed))
     if not 0 < length < math.inf:
-        bad_value("--known-length", "a length above 0", repr(typed))
-    ends, (width, height) = np.array(numbers).reshape(2, 2), capture.frame(name).size
+        bad_value(option, "a length above 0", repr(typed))
+    ends, (width, height) = np.array(numbers).reshape(-1, 2), capture.frame(names[0]).size
     if not ((ends >= 0) & (ends <= (width - 1, height - 1))).all():
-        bad_value("--known-length", f"pixels of {width}x{height}", repr(typed))
-    return capture.frame(name).name, ends, length
+        bad_value(option, f"pixels of {width}x{height}", repr(typed))
+    return [capture.frame(name).name for name in names], ends, length
 
 
 def _factor(capture: Capture, options: CaptureOptions, key: str) -> float | None:
     """Metres per unit of the poses; that of ``--known-length`` by the depth of its frame, found once."""
-    if options.known_length is None:
+    given = _length(capture, options)
+    if given is None:
         return options.metres_per_unit
-    name, ends, metres = _length(capture, options.known_length)
+    names, ends, metres = given
+    solved, numbers = capture.solve(), [capture.names.index(name) for name in names]
+    if options.distance is not None:
+        apart = float(np.linalg.norm(np.diff(solved.E[numbers, :3, 3], axis=0)))
+        if not apart > 0:
+            bad_value("--distance", "of two frames with different positions", repr(options.distance))
+        return metres / apart
     path, asked = options.out / SCALE_FILE, f"{key} {options.known_length}"
     try:
         saved = json.loads(path.read_text(encoding="utf-8"))
@@ -129,9 +143,8 @@ def _factor(capture: Capture, options: CaptureOptions, key: str) -> float | None
             return float(saved["metres_per_unit"])
     except (OSError, ValueError, KeyError, TypeError):
         pass
-    depth = np.asarray(_depth(capture, _pipe(options), name, options).prediction)[0, ..., 0]
-    K = capture.solve().K[capture.names.index(name)]
-    rays = np.linalg.solve(K, np.c_[ends, np.ones(2)].T).T
+    depth = np.asarray(_depth(capture, _pipe(options), names[0], options).prediction)[0, ..., 0]
+    rays = np.linalg.solve(solved.K[numbers[0]], np.c_[ends, np.ones(2)].T).T
     points = rays * depth[tuple(np.rint(ends).astype(int).T[::-1])][:, None]
     factor = metres / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
     write_text(path, json.dumps({"metres_per_unit": factor, "of": asked}) + "\n")

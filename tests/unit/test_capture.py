@@ -1,6 +1,7 @@
 """Poses of a capture solved together, neighbours, agreement and fusion, on a painted room."""
 
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -17,7 +18,7 @@ from geodiff_plugin.capture import run
 from geodiff_plugin.capture.agreement import DepthFrame, agreed
 from geodiff_plugin.capture.capture import choose_neighbours
 from geodiff_plugin.capture.options import CaptureOptions
-from geodiff_plugin.capture.results import fuse
+from geodiff_plugin.capture.results import fuse, write_map, write_mesh
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.frames import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
@@ -156,6 +157,27 @@ def test_the_cloud_lies_on_the_walls_and_its_normals_look_inside():
     assert ((normals * cloud.points_m).sum(1) < 0).mean() > 0.95
 
 
+def test_maps_are_in_colmaps_bytes(tmp_path):
+    values = np.arange(24, dtype=np.float32).reshape(3, 4, 2)
+    write_map(tmp_path / "map.bin", values)
+    head, data = (tmp_path / "map.bin").read_bytes().split(b"&2&")
+    assert head == b"4&3"
+    np.testing.assert_array_equal(np.frombuffer(data, "<f4").reshape(2, 3, 4), values.transpose(2, 0, 1))
+
+
+def test_a_mesh_lies_on_the_walls_or_says_what_is_missing(tmp_path, monkeypatch):
+    frames = {f"f{i}": agreed(depth_frame(i), [depth_frame(i - 1)]) for i in (3, 5)}
+    images = {f"f{i}": render(TRUE[i])[0] / 255 for i in (3, 5)}
+    job = tmp_path / "mesh.ply", list(frames), frames.__getitem__, images.__getitem__
+    with monkeypatch.context() as without, pytest.raises(InputError, match=r"geodiff-plugin\[mesh\]"):
+        without.setitem(sys.modules, "open3d", None)
+        write_mesh(*job)
+    open3d = pytest.importorskip("open3d")
+    write_mesh(*job)
+    corners = np.asarray(open3d.io.read_triangle_mesh(str(job[0])).vertices)
+    assert np.median(np.abs(np.abs(corners) - HALF).min(1)) < 0.01
+
+
 def test_f_score_of_clouds():
     grid = np.stack(np.meshgrid(*[np.arange(4) * 0.2] * 3), -1).reshape(-1, 3)
     assert f_score(grid + 0.02, grid) == 1.0 and f_score(grid[:0], grid) == 0.0
@@ -232,6 +254,7 @@ def a_length() -> str:
     [
         {},
         {"metres_per_unit": 2.0},
+        {"distance": f"f01,f08,{np.linalg.norm(TRUE[8, :3, 3] - TRUE[1, :3, 3])}"},
         {"known_length": a_length()},
     ],
     ids=lambda way: next(iter(way), "none"),
@@ -260,6 +283,7 @@ def test_one_length_gives_all_and_without_one_nothing_says_metres(way, model, tm
     ("options", "words"),
     [
         ({"known_length": "f01:1,2,3,4,-1"}, "above 0"),
+        ({"distance": "f01,f01,1"}, "different positions"),
         ({"known_length": "f01:1,2,3,4"}, "NAME:X1,Y1,X2,Y2,METRES"),
         ({"known_length": "f01:1,2,999,4,1"}, "240x180"),
         ({"known_length": "f77:1,2,3,4,1"}, "f77"),
@@ -268,9 +292,10 @@ def test_one_length_gives_all_and_without_one_nothing_says_metres(way, model, tm
 )
 def test_bad_lengths_get_a_sentence(options, words, model, tmp_path):
     (tmp_path / "out").mkdir()
-    with pytest.raises(InputError, match=words):  # all but the last before any work
+    with pytest.raises(InputError, match=words):  # all but the last and that of positions before any work
         capture = run.open_capture(model(**options))
-        assert words == "without a unit"
+        assert words in ("different positions", "without a unit")
+        run.solved_poses(capture, model(**options))
         capture.known_depths("f01", options["points"])
 
 
@@ -310,6 +335,7 @@ def test_the_command_writes_every_frame_and_goes_on(tmp_path, capsys):
         "cloud.glb",
         "sheet.jpg",
         "colmap/images/f03.png",
+        "colmap/stereo/depth_maps/f03.png.geometric.bin",
         "colmap/sparse/points3D.txt",
     ):
         assert (out / name).is_file()
