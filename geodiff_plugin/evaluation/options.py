@@ -85,7 +85,7 @@ class OutOptions:
         from geodiff_plugin.evaluation.baselines import Settings
         from geodiff_plugin.runtime.machine import pick_device
 
-        given = {each.name: getattr(self, each.name, each.default) for each in fields(Settings)}
+        given: dict[str, Any] = {f.name: getattr(self, f.name, f.default) for f in fields(Settings)}
         return Settings(**given | {"device": str(pick_device(given["device"]))})
 
 
