@@ -25,7 +25,10 @@ from tests.contracts.tiny_priors import CALL, TINY
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"
-MAPS = ("prediction", "confidence", "support", "photometric_error", "visible")
+KEPT = (
+    *("prediction", "confidence", "support", "photometric_error", "visible", "uncertainty", "prior_error"),
+    *("scale", "shift", "global_scale"),
+)
 Result = dict[str, Any]
 
 CASES: dict[str, Callable[[], Result]] = {}
@@ -47,13 +50,7 @@ def real(function: Callable[[], Result]) -> Callable[[], Result]:
 
 def maps_of(output: Any) -> Result:
     """What is frozen of an output."""
-    result = {name: np.asarray(getattr(output, name)) for name in MAPS if getattr(output, name) is not None}
-    numbers = {"scale": output.scale, "shift": output.shift, "global_scale": output.global_scale}
-    result |= {name: np.asarray(value) for name, value in numbers.items() if value is not None}
-    if output.prior_error is not None:
-        result["prior_error"] = np.asarray(output.prior_error)
-    if output.uncertainty is not None:
-        result["uncertainty"] = np.asarray(output.uncertainty)
+    result = {name: np.asarray(getattr(output, name)) for name in KEPT if getattr(output, name) is not None}
     for i, report in enumerate(output.poses):
         result[f"pose_{i}"] = np.stack(report.E)
     return result
@@ -102,56 +99,59 @@ def some_points(depth: np.ndarray, K: np.ndarray, count: int = 200) -> np.ndarra
     return points[z > 0].astype(np.float32)
 
 
+def of_small(**options: Any) -> Callable[[Callable[..., GeometryGuidance]], Callable[..., GeometryGuidance]]:
+    """Register a call on the small pair, guided as the function says of its left, right, K, E and depth."""
+
+    def register(guide: Callable[..., GeometryGuidance]) -> Callable[..., GeometryGuidance]:
+        def run() -> Result:
+            of_pair = small()
+            return maps_of(call(bundled_prior(), of_pair[0], guide(*of_pair), **options))
+
+        CASES[guide.__name__] = run
+        return guide
+
+    return register
+
+
 @case
 def default_bundled_pair() -> Result:
     left, right, rig, _ = pair()
     return maps_of(call(bundled_prior(), left, GeometryGuidance(right, (rig.K_left, rig.K_right), rig.E)))
 
 
-@case
-def preset_paper() -> Result:
-    left, right, K, E, _ = small()
-    guidance = GeometryGuidance.paper(right, K, E)
-    return maps_of(call(bundled_prior(), left, guidance, num_inference_steps=3))
+@of_small(num_inference_steps=3)
+def preset_paper(left, right, K, E, depth) -> GeometryGuidance:
+    return GeometryGuidance.paper(right, K, E)
 
 
-@case
-def preset_marigold_dc() -> Result:
-    left, _, K, _, depth = small()
-    guidance = GeometryGuidance.marigold_dc(some_points(depth, K), K)
-    return maps_of(call(bundled_prior(), left, guidance, num_inference_steps=3))
+@of_small(num_inference_steps=3)
+def preset_marigold_dc(left, right, K, E, depth) -> GeometryGuidance:
+    return GeometryGuidance.marigold_dc(some_points(depth, K), K)
 
 
-@case
-def preset_search_only() -> Result:
-    left, right, K, E, _ = small()
-    return maps_of(call(bundled_prior(), left, GeometryGuidance.search_only(right, K, E)))
+@of_small()
+def preset_search_only(left, right, K, E, depth) -> GeometryGuidance:
+    return GeometryGuidance.search_only(right, K, E)
 
 
-@case
-def gradient_updates() -> Result:
-    left, right, K, E, _ = small()
-    knobs = {"inner_steps": 3, "step_latents": 0.03}
-    return maps_of(call(bundled_prior(), left, GeometryGuidance(right, K, E, **knobs)))
+@of_small()
+def gradient_updates(left, right, K, E, depth) -> GeometryGuidance:
+    return GeometryGuidance(right, K, E, inner_steps=3, step_latents=0.03)
 
 
-@case
-def updates_without_correction() -> Result:
-    left, right, K, E, _ = small()
-    return maps_of(call(bundled_prior(), left, GeometryGuidance(right, K, E, correct=False, inner_steps=4)))
+@of_small()
+def updates_without_correction(left, right, K, E, depth) -> GeometryGuidance:
+    return GeometryGuidance(right, K, E, correct=False, inner_steps=4)
 
 
-@case
-def points_alone() -> Result:
-    left, _, K, _, depth = small()
-    return maps_of(call(bundled_prior(), left, GeometryGuidance.from_points(some_points(depth, K), K)))
+@of_small()
+def points_alone(left, right, K, E, depth) -> GeometryGuidance:
+    return GeometryGuidance.from_points(some_points(depth, K), K)
 
 
-@case
-def points_and_view() -> Result:
-    left, right, K, E, depth = small()
-    guidance = GeometryGuidance(right, K, E, points=some_points(depth, K, 60))
-    return maps_of(call(bundled_prior(), left, guidance))
+@of_small()
+def points_and_view(left, right, K, E, depth) -> GeometryGuidance:
+    return GeometryGuidance(right, K, E, points=some_points(depth, K, 60))
 
 
 def _third_view() -> list[tuple[Any, np.ndarray, np.ndarray]]:
@@ -194,18 +194,15 @@ def batch_of_two() -> Result:
     return maps_of(call(bundled_prior(), [left, left.transpose(Image.Transpose.ROTATE_180)], guidance))
 
 
-@case
-def ensemble_of_two() -> Result:
-    left, right, K, E, _ = small()
-    options = {"ensemble_size": 2, "output_uncertainty": True}
-    return maps_of(call(bundled_prior(), left, GeometryGuidance(right, K, E), **options))
+@of_small(ensemble_size=2, output_uncertainty=True)
+def ensemble_of_two(left, right, K, E, depth) -> GeometryGuidance:
+    return GeometryGuidance(right, K, E)
 
 
-@case
-def warm_start() -> Result:
-    left, right, K, E, _ = small()
+@of_small()
+def warm_start(left, right, K, E, depth) -> GeometryGuidance:
     first = call(bundled_prior(), left, GeometryGuidance(right, K, E), output_latent=True)
-    return maps_of(call(bundled_prior(), left, GeometryGuidance(right, K, E, previous=first)))
+    return GeometryGuidance(right, K, E, previous=first)
 
 
 @case
@@ -225,12 +222,10 @@ def tiny_decoder() -> Result:
         return maps_of(call(enable_geometry_guidance(TINY["marigold"]()), left, guidance))
 
 
-@case
-def exposure() -> Result:
-    left, right, K, E, _ = small()
+@of_small()
+def exposure(left, right, K, E, depth) -> GeometryGuidance:
     dark = Image.fromarray((np.asarray(right) * 0.6 + 10).astype(np.uint8))
-    guidance = GeometryGuidance(dark, K, E, correct=False, inner_steps=3)
-    return maps_of(call(bundled_prior(), left, guidance))
+    return GeometryGuidance(dark, K, E, correct=False, inner_steps=3)
 
 
 @case

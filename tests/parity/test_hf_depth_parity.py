@@ -44,6 +44,14 @@ def as_tensor(photograph: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(photograph).permute(2, 0, 1)[None] / 255.0
 
 
+def made(kind: str) -> tuple:
+    """A model, what prepares its images, and the pipeline of it."""
+    torch.manual_seed(0)
+    model, config = MODELS[kind]()
+    spread(model)
+    return model, Preparation(config), TransformersDepthPipeline(model, DirectScheduler(0), config)
+
+
 @pytest.mark.parametrize("name", PROCESSORS)
 def test_preparation(name, photograph):
     processor = PROCESSORS[name]
@@ -58,15 +66,11 @@ def test_preparation(name, photograph):
 
 @pytest.mark.parametrize("kind", ["depth_anything", "dpt", "glpn"])
 def test_map(kind, photograph):
-    torch.manual_seed(0)
-    model, config = MODELS[kind]()
-    spread(model)
-    preparation = Preparation(config)
+    model, preparation, pipe = made(kind)
     processor = (GLPNImageProcessorPil if kind == "glpn" else DPTImageProcessorPil)()
     with torch.no_grad():
         output = model(pixel_values=preparation(as_tensor(photograph)))
     theirs = processor.post_process_depth_estimation(output, [photograph.shape[:2]])[0]["predicted_depth"]
-    pipe = TransformersDepthPipeline(model, DirectScheduler(0), config)
     ours = pipe.predict(as_tensor(photograph), photograph.shape[:2])
     assert theirs.std() > 0
     torch.testing.assert_close(ours[0, 0], theirs, rtol=0, atol=1e-6)
@@ -86,26 +90,17 @@ def theirs_without_torchvision(kind: str, monkeypatch):
     return next(v for k, v in vars(module).items() if k.lower() == kind.replace("_", "") + "imageprocessor")
 
 
-@pytest.mark.parametrize(
-    ("kind", "library"),
-    [
-        ("depth_pro", "depth_pro"),
-        ("prompt_depth_anything", "prompt_depth_anything"),
-        ("tipsv2", "tipsv2_dpt"),
-    ],
-)
+@pytest.mark.parametrize("kind", ["depth_pro", "prompt_depth_anything", "tipsv2"])
 @torch.no_grad()
-def test_metres_by_the_librarys_own_ending(kind, library, photograph, monkeypatch):
-    torch.manual_seed(0)
-    model, config = MODELS[kind]()
-    spread(model)
-    preparation, told = Preparation(config), {}
+def test_metres_by_the_librarys_own_ending(kind, photograph, monkeypatch):
+    (model, preparation, pipe), told = made(kind), {}
     if kind == "prompt_depth_anything":
         told["prompt_depth"] = torch.rand(1, 1, 12, 16) * 3 + 1
     output = model(pixel_values=preparation(as_tensor(photograph)), **told)
-    ending = theirs_without_torchvision(library, monkeypatch).post_process_depth_estimation
+    ending = theirs_without_torchvision(
+        {"tipsv2": "tipsv2_dpt"}.get(kind, kind), monkeypatch
+    ).post_process_depth_estimation
     theirs = ending(SimpleNamespace(resample=2), output, [photograph.shape[:2]])[0]["predicted_depth"]
-    pipe = TransformersDepthPipeline(model, DirectScheduler(0), config)
     ours = pipe.metres(pipe.predict(as_tensor(photograph), photograph.shape[:2], told.get("prompt_depth")))
     assert theirs.std() > 0
     torch.testing.assert_close(ours[0, 0], theirs, rtol=1e-5, atol=1e-5)
