@@ -21,6 +21,8 @@ TURNS = range(2, 9)
 #: 16-bit values that all lie below this are those of a camera of 10 or 12 bits, as they come.
 DARK_16_BITS = 8192
 CHANNELS = (1, 3, 4)
+#: Formats that hold several frames or pages of one kind; others hold previews.
+SEVERAL = ("GIF", "PNG", "TIFF", "WEBP")
 
 
 def _check_sides(width: int, height: int, name: str) -> None:
@@ -43,6 +45,25 @@ def _array_of(image: Image.Image, name: str) -> np.ndarray:
     return np.asarray(image.convert("RGBA" if alpha else "RGB"))
 
 
+def _file_notes(image: Image.Image, name: str) -> list[str]:
+    """What to say of an opened image before its pixels: several frames; few of 16 bits used, in colour."""
+    notes, frames = [], getattr(image, "n_frames", 1)
+    if frames > 1 and image.format in SEVERAL:
+        notes.append(f"{name} holds {frames} frames or pages; only the first is taken.")
+    # Pillow loads the upper 8 bits of these, and tells only before.
+    if any(";16" in str(tile[3]) for tile in getattr(image, "tile", ())) and not image.mode.startswith("I"):
+        most = 257 * max(high for _, high in image.convert("RGB").getextrema())
+        notes += [_dark_note(most, name)] if most < DARK_16_BITS else []
+    return notes
+
+
+def _dark_note(most: int, name: str) -> str:
+    return (
+        f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535. "
+        "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
+    )
+
+
 def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
     """``(H, W, 3)`` float32 in [0, 1] of ``(H, W)`` or ``(H, W, C)`` numbers, and what to say of them."""
     value, notes = value[..., None] if value.ndim == 2 else value, []
@@ -50,10 +71,7 @@ def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
         value, notes = value[..., :3], [f"{name} has an alpha channel; it is dropped."]
     if value.dtype in (np.uint8, np.uint16):
         if value.dtype == np.uint16 and value.max() < DARK_16_BITS:
-            notes.append(
-                f"{name} is a 16-bit image that is nearly black: its values reach {value.max()} of 65535. "
-                "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
-            )
+            notes.append(_dark_note(int(value.max()), name))
         value = value.astype(np.float32) / np.iinfo(value.dtype).max
     elif value.dtype.kind == "f":
         if not np.isfinite(value).all():
@@ -78,10 +96,13 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
         OSError, ValueError: no readable file; not an image, cut off, or a side under 32 pixels.
     """
     with open_image(path, name) as image:
+        said = _file_notes(image, name)
+        image.seek(0)
         image.load()
         is_turned = image.getexif().get(ORIENTATION) in TURNS
         upright = ImageOps.exif_transpose(image)
     image_01, notes = _to_01(_array_of(upright, name), name)
+    notes = said + notes
     if is_turned:
         notes.append(
             f"{name} was turned or mirrored to {upright.width}x{upright.height}, as its EXIF orientation "
@@ -133,7 +154,9 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
         ValueError: wrong rank or channels, NaN or infinity, floats outside [0, 1], a side under 32 pixels.
     """
     if isinstance(value, Image.Image):
+        said = _file_notes(value, name)
         hwc, notes = _to_01(_array_of(value, name), name)
+        notes = said + notes
         if value.getexif().get(ORIENTATION) in TURNS:
             notes.append(
                 f"{name} carries an EXIF orientation that is not applied; "

@@ -4,6 +4,7 @@ import io
 import sys
 import warnings
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -112,6 +113,28 @@ def test_a_cut_off_image_is_a_sentence(tmp_path, suffix):
     path.write_bytes(b"hello")
     with pytest.raises(ValueError, match="a format that Pillow does not read"):
         read_image(path)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_12_bits_in_a_coloured_file_are_told(tmp_path, channels):
+    """Pillow keeps the upper 8 bits of these, and no mode that tells."""
+    for times, told in ((16, True), (257, False)):
+        deep = np.full((*RAMP.shape[:2], channels), 65535, np.uint16)
+        deep[..., :3] = RAMP.astype(np.uint16) * times
+        assert cv2.imwrite(str(tmp_path / f"{times}.png"), deep)
+        notes = [note for note in read_image(tmp_path / f"{times}.png")[1] if "alpha" not in note]
+        assert ["nearly black" in note for note in notes] == [True] * told
+
+
+@pytest.mark.parametrize("name", ["x.gif", "x.png", "x.tiff", "x.webp"])
+def test_only_the_first_of_several_frames_is_taken_and_told(tmp_path, name):
+    more = {"lossless": True} if name == "x.webp" else {}
+    frames = {"save_all": True, "append_images": [Image.fromarray(RAMP[::-1])], **more}
+    path = saved(tmp_path, Image.fromarray(RAMP), name, **frames)
+    assert read_image(path)[1] == ["left holds 2 frames or pages; only the first is taken."]
+    with Image.open(path) as opened, pytest.warns(UserWarning, match="left holds 2 frames"):
+        as_image_01(opened, "left")
+    assert read_image(saved(tmp_path, Image.fromarray(RAMP), "one.gif"))[1] == []
 
 
 def test_heic_is_read_where_pillow_heif_is(tmp_path, monkeypatch):
