@@ -158,7 +158,7 @@ def _measure(
     seconds = time.perf_counter() - start + priors.evidence.take_spared_seconds()
     cost = {"seconds": round(seconds, 3), "peak_bytes": memory.peak_bytes}
     scores = score(cropped(sample, crop), prediction, DATASETS[sample.dataset].cap_m)
-    notes = {"notes": {"sample": dict(sample.notes), "method": dict(prediction.notes)}}
+    notes: dict[str, Any] = {"notes": {"sample": dict(sample.notes), "method": dict(prediction.notes)}}
     if path is not None and prediction.depth_m is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_depth_npy(path, prediction.depth_m)

@@ -45,7 +45,7 @@ MARKERS = "osD^vP"
 EXPOSURE_METHODS = ("paper", "guided", "sgbm")
 #: Half and twice the light, and the steps between; also exponents.
 GAINS = (0.5, 0.7, 1.0, 1.4, 2.0)
-PRESETS, SECONDS = ("guided", "paper"), itemgetter("seconds")
+PRESETS = ("guided", "paper")
 
 
 def _new_figure(width_in: float, height_in: float) -> Any:
@@ -113,7 +113,8 @@ def draw_inner_steps(options: FigureOptions) -> Drawing:
     groups = {preset: [records.get(name, []) for name in names] for preset, names in methods.items()}
     figure, numbers = _new_figure(7.6, 3.1), {"samples": [ref.label for ref in refs], "updates": updates}
     panels = figure.subplots(1, 2)
-    errors, seconds = (_curves(panels[k], updates, groups, v) for k, v in enumerate((headline, SECONDS)))
+    errors = _curves(panels[0], updates, groups, headline)
+    seconds = _curves(panels[1], updates, groups, itemgetter("seconds"))
     for axes, title in zip(panels, ("AbsRel", "seconds a pair"), strict=True):
         _name_axes(axes, "updates per denoising step", title, updates)
         axes.set_ylim(bottom=0)

@@ -27,8 +27,10 @@ from geodiff_plugin.runner import Item, Record, this_process
 
 def pair_cells(refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions) -> list[Item]:
     """Cells of methods on samples, scored as the options say."""
-    names, how = tuple(dict.fromkeys(methods)), {"crop": options.crop, "save_depth": options.save_depth}
-    return experiment.method_cells(refs, names, options.settings, options.out, **how)
+    names, settings, crop = tuple(dict.fromkeys(methods)), options.settings, options.crop
+    return experiment.method_cells(
+        refs, names, settings, options.out, crop=crop, save_depth=options.save_depth
+    )
 
 
 def compare(

@@ -37,8 +37,8 @@ from geodiff_plugin.types import Rig
 
 def _read_pair(ref: SampleRef) -> tuple[Images, Rig]:
     """Images and rig of the files ``left``, ``right``, ``calibration`` and, if any, ``calibration_right``."""
-    files = ref.files
-    left, right, first, second = (files.get(k) for k in ("left", "right", "calibration", "calibration_right"))
+    files, second = ref.files, ref.files.get("calibration_right")
+    left, right, first = files["left"], files["right"], files["calibration"]
     images = read_rgb(left, "left image"), read_rgb(right, "right image")
     given, names = first if second is None else (first, second), (left.name, right.name)
     size = {"image_names": names, "image_size": images[0].shape[1::-1]}
