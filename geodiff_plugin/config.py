@@ -9,6 +9,7 @@ import difflib
 import inspect
 import json
 import re
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import Field, dataclass, field, fields, replace
 from pathlib import Path
@@ -278,8 +279,18 @@ class GuidanceConfig:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """What ``to_dict`` gave; what is missing is as in the default. ``InputError`` as ``changed``."""
-        return cls().changed(**_mapping(values, "the configuration"))
+        """What ``to_dict`` gave, also in former versions; what is missing is as in the default.
+
+        A warning names what is no knob any more. ``InputError`` for a value, or a knob that is misspelt.
+        """
+        flat: dict[str, Any] = {}
+        for name, value in _mapping(values, "the configuration").items():
+            is_stage = name not in KNOBS and isinstance(value, Mapping)
+            flat |= value if is_stage else {name: value}
+        known = {n: v for n, v in flat.items() if n in KNOBS or difflib.get_close_matches(n, KNOBS, 1, 0.85)}
+        if gone := [name for name in flat if name not in known]:
+            warnings.warn(f"No longer knobs, and left out: {', '.join(gone)}.", stacklevel=2)
+        return cls().changed(**known)
 
     def save(self, path: str | Path) -> None:
         """Write a JSON file."""

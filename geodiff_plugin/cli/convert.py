@@ -50,6 +50,9 @@ def run_convert(paths: Sequence[Path], part: str | None = None, space: str | Non
             kind = _convert_file(source, unfinished, part)
         unfinished.chmod(0o755)  # mkdtemp's is its owner's alone
         os.replace(unfinished, target)
+    except (KeyError, RuntimeError, AttributeError, TypeError) as error:  # of networks that it does not fit
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        bad_value("SRC", "a whole checkpoint of its kind", f"{source} ({reason})", "Fetch it anew.")
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     print(f"{source} ({kind}) -> {target}; use it with --prior {target}")

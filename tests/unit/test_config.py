@@ -94,6 +94,9 @@ def test_a_saved_configuration_with_a_strange_name_is_refused(tmp_path):
     with pytest.raises(InputError, match="a JSON file"):
         GuidanceConfig.load(tmp_path / "guidance.json")
     assert GuidanceConfig.from_dict({"stop": 0.5}) == DEFAULT.changed(stop=0.5)
+    former = {"correction": {"smoothness": 3.0, "passes": 3}, "loss_resolution": 512}
+    with pytest.warns(UserWarning, match="left out: passes, loss_resolution"):
+        assert GuidanceConfig.from_dict(former) == DEFAULT.changed(smoothness=3.0)
 
 
 def test_knobs_as_typed():
