@@ -11,6 +11,7 @@ import numpy as np
 
 from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.runner import Record
+from geodiff_plugin.runtime.confidence import RIGHT_WITHIN
 
 #: Below this number of images there is no interval: resampling four values says nothing.
 FEWEST_FOR_INTERVAL = 5
@@ -253,13 +254,25 @@ def versus_table(records: Sequence[Record], reference: str) -> Table:
 
 
 _DISPARITY = {"epe": "EPE px", "bad1": "bad-1", "bad2": "bad-2", "bad3": "bad-3", "d1": "D1"}
+_BY_REGION = {
+    f"{region}.{name}": f"{region}, {heading}"
+    for region in ("visible", "edge", "flat")
+    for name, heading in _DISPARITY.items()
+    if name != "bad3"
+}
 #: Title -> where in a record its numbers are, their headings, note.
 _DETAILS: dict[str, tuple[str, dict[str, str], str]] = {
     "Disparity, rectified pairs": (
         "disparity.",
         _DISPARITY,
         "Metres turned into disparity at the left image's resolution; shares of pixels for bad-k and D1, "
-        "a dash where the truth's step is coarser than the threshold. By region in samples.jsonl.",
+        "a dash where the truth's step is coarser than the threshold.",
+    ),
+    "Disparity by region, rectified pairs": (
+        "disparity.regions.",
+        _BY_REGION,
+        "Visible: neither hidden in the right view nor beside it; edge: within 4 px of a step of the true "
+        "disparity of more than 3 px; flat: the rest.",
     ),
     "Boundaries, dense truth": (
         "boundaries.",
@@ -306,6 +319,22 @@ def details_tables(records: Sequence[Record]) -> list[Table]:
     return [regions_table(records), *(_details(records, title, *rest) for title, rest in _DETAILS.items())]
 
 
+def confidence_table(records: Sequence[Record]) -> Table:
+    """What the confidence of each method promises by decile, and what it keeps; pairs weigh the same."""
+    rows = []
+    for method, deciles_of in by_method(records, lambda record: record.get("confidence")).items():
+        for k, parts in enumerate(zip(*deciles_of.values(), strict=True)):
+            shares = np.array([part["share"] for part in parts])
+            if shares.any():
+                values = [[part[name] or 0.0 for part in parts] for name in ("promised", "kept", "abs_rel")]
+                means = (np.array(values) @ shares) / shares.sum()
+                name = f"{k / 10:.1f} to {(k + 1) / 10:.1f}"
+                rows.append((find_method(method).title, name, cell(shares.mean()), *map(cell, means)))
+    note = f"Confidence is the probability of a relative error below {RIGHT_WITHIN:g}; pixels of all pairs."
+    header = ("method", "confidence", "share of pixels", "promised", "kept", "AbsRel")
+    return Table("Confidence by decile", header, tuple(rows), note)
+
+
 def pairs_tables(records: Sequence[Record], reference: str = "guided") -> list[Table]:
     """The tables of ``geodiff eval pairs``."""
     note = (
@@ -318,4 +347,5 @@ def pairs_tables(records: Sequence[Record], reference: str = "guided") -> list[T
         *([versus_table(records, reference)] if any(r["method"] == reference for r in records) else []),
         *(summary_table(records, own, f"All metrics, {group}") for group, own in groups_of(records).items()),
         *details_tables(records),
+        confidence_table(records),
     ]

@@ -47,12 +47,12 @@ def _array_of(image: Image.Image, name: str) -> np.ndarray:
 
 def _file_notes(image: Image.Image, name: str) -> list[str]:
     """What to say of an opened image before its pixels: several frames; few of 16 bits used, in colour."""
-    notes, frames = [], getattr(image, "n_frames", 1)
+    notes, frames = list[str](), getattr(image, "n_frames", 1)
     if frames > 1 and image.format in SEVERAL:
         notes.append(f"{name} holds {frames} frames or pages; only the first is taken.")
     # Pillow loads the upper 8 bits of these, and tells only before.
     if any(";16" in str(tile[3]) for tile in getattr(image, "tile", ())) and not image.mode.startswith("I"):
-        most = 257 * max(high for _, high in image.convert("RGB").getextrema())
+        most = 257 * int(np.asarray(image.convert("RGB")).max())
         notes += [_dark_note(most, name)] if most < DARK_16_BITS else []
     return notes
 
