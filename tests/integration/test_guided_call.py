@@ -257,6 +257,11 @@ CAST = torch.bfloat16, torch.float32
     [
         (_scheduled(EulerDiscreteScheduler), {}, "EulerDiscreteScheduler"),
         (_scheduled(DDIMScheduler, **SCHEDULER, thresholding=True), {}, "thresholding"),
+        (
+            _scheduled(DDIMScheduler, **SCHEDULER | {"prediction_type": "epsilon"}),
+            {},
+            "rescale_betas_zero_snr",
+        ),
         (_sequential, {}, "sequential"),
         (lambda p: setattr(p, "_all_hooks", [object()]), FULL, "enable_model_cpu_offload"),
         (lambda p: p.vae.enable_layerwise_casting(*CAST), {}, "layerwise casting"),
