@@ -5,6 +5,7 @@ import json
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,7 +26,6 @@ class Interrupted(Exception):
 @pytest.fixture
 def host(monkeypatch, tmp_path):
     """Stubs of ``folder_paths`` and ``comfy``, as far as nodes use them."""
-    state = SimpleNamespace(bars=[], freed=[], interrupt=False, folder=tmp_path)
 
     def save_path(prefix, output):
         name, below = Path(prefix).name, Path(prefix).parent
@@ -33,34 +33,20 @@ def host(monkeypatch, tmp_path):
         folder.mkdir(parents=True, exist_ok=True)
         return str(folder), name, 1 + len(list(folder.iterdir())), str(below), prefix
 
-    class ProgressBar:
-        def __init__(self, total):
-            self.done = 0
-            state.bars.append(self)
-
-        def update(self, count):
-            self.done += count
-
-    def throw():
-        if state.interrupt:
-            raise Interrupted
-
+    host = SimpleNamespace(folder=tmp_path, bar=Mock(), free=Mock(), throw=Mock())
     folders = SimpleNamespace(
         get_input_directory=lambda: str(tmp_path),
         get_output_directory=lambda: str(tmp_path / "output"),
         get_save_image_path=save_path,
     )
-    utils = SimpleNamespace(ProgressBar=ProgressBar)
-    management = SimpleNamespace(
-        get_torch_device=lambda: torch.device("cpu"),
-        throw_exception_if_processing_interrupted=throw,
-        free_memory=lambda size, device: state.freed.append(size),
-    )
+    utils, management = SimpleNamespace(ProgressBar=host.bar), SimpleNamespace(free_memory=host.free)
+    management.throw_exception_if_processing_interrupted = host.throw
+    management.get_torch_device = lambda: torch.device("cpu")
     comfy = SimpleNamespace(utils=utils, model_management=management)
     stubs = {"comfy.utils": utils, "comfy.model_management": management}
     for name, stub in ({"folder_paths": folders, "comfy": comfy} | stubs).items():
         monkeypatch.setitem(sys.modules, name, stub)
-    return state
+    return host
 
 
 @pytest.fixture
@@ -124,7 +110,7 @@ def test_the_nodes_run_along_the_workflow(pack, pair, prior, host, textured_plan
         )
     depth, coloured, near_is_white, confidence, verdict = answer["result"]
     assert verdict.startswith(("Trusted.", "Not trusted. ")) and answer["ui"]["text"] == [verdict]
-    assert host.freed and host.freed[0] > 0, "room that the host made"
+    assert host.free.call_args_list[0].args[0] > 0, "room that the host made"
     size = textured_plane.depth_m.shape
     assert depth["depth_m"].shape == (2, *size) and (depth["depth_m"] > 0).all()
     assert coloured.shape == near_is_white.shape == (2, *size, 3) and coloured.dtype == torch.float32
@@ -132,7 +118,7 @@ def test_the_nodes_run_along_the_workflow(pack, pair, prior, host, textured_plan
     assert near_is_white.min() == 0 and near_is_white.max() == 1
     nearest = np.unravel_index(depth["depth_m"][0].argmin(), size)
     assert near_is_white[0][nearest].min() == 1
-    assert host.bars[0].done > 0
+    assert host.bar.return_value.update.call_args.args[0] > 0
     for kind, magic in (("glb", b"glTF"), ("ply", b"ply\n")):
         answer = classes["GeoDiffPointCloud"]().write(depth, 0.0, kind, "geodiff/cloud")
         assert (host.folder / "output" / answer["result"][0]).read_bytes()[:4] == magic
@@ -161,7 +147,7 @@ def test_files_are_those_of_the_input_folder(pack, host):
 
 
 def test_the_host_can_interrupt(pack, pair, prior, host):
-    host.interrupt = True
+    host.throw.side_effect = Interrupted
     node = pack.NODE_CLASS_MAPPINGS["GeoDiffDepth"]()
     (rig,) = pack.NODE_CLASS_MAPPINGS["GeoDiffCalibration"]().read("K.txt")
     with pytest.raises(Interrupted):
