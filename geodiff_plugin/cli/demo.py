@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+import tempfile
+import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -10,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from geodiff_plugin.bundled.demo_pair import DemoPair, read_demo_pair
+from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, DemoPair, read_demo_pair
 from geodiff_plugin.cli.depth import estimate_and_write
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.outputs import single_map, summary_line
@@ -85,8 +90,21 @@ def measure(gradient: str | None, device_name: str, repeats: int = 2, **knobs: A
     return min([timed(call, device) for _ in range(repeats)], default=first), memory.peak_bytes
 
 
+def _command_seconds(device: str) -> dict[str, float]:
+    """Seconds of ``geodiff depth`` on the demo pair by stage; "python" is what lies around them."""
+    with tempfile.TemporaryDirectory() as folder:
+        images = [str(DEMO_PAIR_FOLDER / name) for name in ("left.png", "right.png")]
+        options = ["--calib", str(DEMO_PAIR_FOLDER / "calib.txt"), "--device", device, "--json", "--quiet"]
+        words = [sys.executable, "-m", "geodiff_plugin", "depth", *images, *options, "--out", f"{folder}/out"]
+        started = time.perf_counter()
+        answer = subprocess.run(words, check=True, capture_output=True, text=True)
+        whole = time.perf_counter() - started
+    stages: dict[str, float] = json.loads(answer.stdout)["seconds"]
+    return stages | {"python": whole - sum(stages.values())}
+
+
 def run_bench(device: str) -> None:
-    """Print the table; every row is measured in a process of its own."""
+    """Print the table, every row measured in a process of its own, and where a command's time goes."""
     place, costs = pick_device(device), []
     where = f"{place}, {torch.get_num_threads()} threads, torch {torch.__version__}"
     table = new_table(("", "seconds", "peak MB", "time x", "memory x"))
@@ -96,4 +114,7 @@ def run_bench(device: str) -> None:
         seconds, peak_bytes = costs[-1]
         ratios = f"{seconds / costs[0][0]:.2f}", f"{peak_bytes / max(costs[0][1], 1):.2f}"
         table.add_row(name, f"{seconds:.2f}", f"{peak_bytes / 1e6:.0f}", *ratios)
-    show(f"bundled prior, default guidance; {where}; demo pair", table)
+    stages = _command_seconds(str(place))
+    told = ", ".join(f"{name} {seconds:.1f}" for name, seconds in stages.items())
+    command = f"geodiff depth: {sum(stages.values()):.1f} s ({told})"
+    show(f"bundled prior, default guidance; {where}; demo pair", table, command)
