@@ -283,6 +283,8 @@ def test_table(monkeypatch, capsys):
 
     monkeypatch.setattr("geodiff_plugin.cli.demo.ProcessPoolExecutor", Inline)
     run_bench("cpu")
-    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    printed = capsys.readouterr().out
+    assert re.search(r"geodiff depth: [\d.]+ s \(start .*guided call [\d.]+, write", printed)
+    lines = [line.split() for line in printed.splitlines()]
     rows = [words[-4:] for words in lines if words and re.fullmatch(r"\d\.\d\d", words[-1])]
     assert rows[1] == ["2.00", "150", "2.00", "1.50"] and rows[2] == ["3.00", "400", "3.00", "4.00"]
