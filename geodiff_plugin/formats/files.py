@@ -51,6 +51,10 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
     return file
 
 
+#: What Pillow raises at a damaged file.
+DECODE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, KeyError, EOFError, zlib.error)
+
+
 @contextmanager
 def open_image(path: str | os.PathLike[str], name: str, what: str = "an image file") -> Iterator[Image.Image]:
     """Open an image file with Pillow, HEIC by pillow-heif; what is none, or damaged, is refused."""
@@ -74,7 +78,7 @@ def open_image(path: str | os.PathLike[str], name: str, what: str = "an image fi
         raise
     except UnidentifiedImageError:
         bad_value(name, what, f"{file}, a format that Pillow does not read", "Convert it to PNG or JPEG.")
-    except (Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError, zlib.error) as error:
+    except (Image.DecompressionBombError, *DECODE_ERRORS) as error:
         cure = "Is it cut off, or too large?"
         bad_value(name, "a whole image file", f"{file}, which does not decode ({error})", cure)
 
