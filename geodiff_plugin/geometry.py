@@ -69,14 +69,6 @@ def as_fine_as(image_01: Tensor, K: Tensor, K_left: Tensor) -> tuple[Tensor, Ten
     return resize_image(image_01, K, (max(1, round(height * rows)), max(1, round(width * columns))))
 
 
-def nearest_rotation(matrix: Tensor) -> Tensor:
-    """The proper rotation nearest to a matrix ``(..., 3, 3)`` (orthogonal Procrustes)."""
-    u, _, vh = torch.linalg.svd(matrix)
-    sign = torch.ones_like(matrix[..., 0])
-    sign[..., 2] = torch.linalg.det(u @ vh).sign()
-    return (u * sign[..., None, :]) @ vh
-
-
 def is_rectified(K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> Tensor:
     """Whether disparity along rows says everything, ``(...)`` bool, of ``(..., 3, 3)`` and ``(..., 4, 4)``.
 

@@ -284,6 +284,13 @@ class GuidedDenoiseLoop(DenoiseLoop):
     block_names = ["denoiser", "geometry", "scheduler", "after"]
 
 
+def _at_image_size(processor: Any, values: torch.Tensor, block_state: Any) -> Any:
+    """``(1, H, W, 1)`` array of a map ``(1, 1, h, w)``, unpadded and resized to the image."""
+    values = processor.unpad_image(values, block_state.padding)
+    resized = processor.resize_antialias(values, block_state.original_resolution, "bilinear", is_aa=False)
+    return processor.pt_to_numpy(resized)
+
+
 class DecodeStep(Block):
     """Decodes the relative depth, as the stock pipeline does."""
 
@@ -296,10 +303,7 @@ class DecodeStep(Block):
         vae, processor = components.vae, components.image_processor
         decoded = vae.decode(block_state.latents / vae.config.scaling_factor, return_dict=False)[0]
         map_01 = (torch.clip(decoded.mean(dim=1, keepdim=True), -1.0, 1.0) + 1.0) / 2.0
-        map_01 = processor.unpad_image(map_01, block_state.padding)
-        size = block_state.original_resolution
-        map_01 = processor.resize_antialias(map_01, size, "bilinear", is_aa=False)
-        block_state.relative_depth = processor.pt_to_numpy(map_01)
+        block_state.relative_depth = _at_image_size(processor, map_01, block_state)
 
 
 class GeometryEvidenceStep(Block):
@@ -372,11 +376,9 @@ class MetresStep(Block):
     def run(self, components: Any, block_state: Any) -> None:
         """As the guided pipeline ends a call."""
         run, processor = block_state.geometry, components.image_processor
-        depth_m = processor.unpad_image(run.metric_prediction(block_state.latents), block_state.padding)
-        size = block_state.original_resolution
-        depth_m = processor.resize_antialias(depth_m, size, "bilinear", is_aa=False)
+        depth_m = _at_image_size(processor, run.metric_prediction(block_state.latents), block_state)
         run.check_finite()
-        stock = MarigoldDepthOutput(processor.pt_to_numpy(depth_m), None, None)
+        stock = MarigoldDepthOutput(depth_m, None, None)
         guidance = block_state.guidance
         out = assemble_output(stock, run, guidance, block_state.call, guidance.warned)
         block_state.guided_output, block_state.depth_m = out, out.prediction[0, ..., 0]

@@ -14,8 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 from geodiff_plugin.app import look
 from geodiff_plugin.app.measure import Reading, distance_m, metres, read_pixel
 from geodiff_plugin.cli.depth import Job
-from geodiff_plugin.cli.outputs import cameras_of, single_map
-from geodiff_plugin.formats import flying_points, make_cloud, write_glb
+from geodiff_plugin.cli.outputs import cameras_of, cloud_of, single_map
+from geodiff_plugin.formats import write_glb
 from geodiff_plugin.formats.out import REPORT
 from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, ticks
 
@@ -173,11 +173,7 @@ def _write_readings(path: Path, readings: Sequence[Reading]) -> None:
 
 def write_scene(path: Path, job: Job, least_confidence: float) -> int:
     """Cloud and cameras as GLB, light enough for a browser; how many points there are in all."""
-    depth_m, confidence = depth_of(job), map_of(job, "confidence")
-    keep = ~flying_points(depth_m)
-    if confidence is not None:
-        keep &= confidence >= least_confidence
-    cloud = make_cloud(depth_m, job.inputs.left, K_of(job), keep)
+    cloud = cloud_of(job.output, job.inputs.left, least_confidence)
     write_glb(path, cloud.thinned(MOST_POINTS_SHOWN), cameras_of(job.output, job.inputs.guidance))
     return len(cloud.points_m)
 

@@ -25,8 +25,6 @@ ALONE = ("depth_alone", "confidence_alone")
 AGREED = ("depth", "confidence", "confirmed", "asked")
 #: Frames that a frame is checked against, frames on the contact sheet, points of the GLB.
 OTHERS, ON_SHEET, GLB_POINTS = 6, 24, 400_000
-
-
 #: Points closer than this share of the median depth are one; points of lower confidence are left out.
 CELL_SHARE, LEAST_CONFIDENCE = 0.004, 0.5
 #: Points of one frame at most; more would not show in a cloud of many frames.

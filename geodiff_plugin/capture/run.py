@@ -24,7 +24,7 @@ from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.capture.options import CaptureOptions
 from geodiff_plugin.capture.results import ALONE, write_agreement, write_results
 from geodiff_plugin.formats.depth import read_map
-from geodiff_plugin.formats.files import read_matrix
+from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
 from geodiff_plugin.formats.out import OutFolder, atomic_path, write_text
 from geodiff_plugin.pose.capture import Observations, SolvedCapture
 from geodiff_plugin.priors import load_prior
@@ -43,8 +43,6 @@ OF_SCALE = ("metres_per_unit", "known_length", "distance")
 OF_FRAME = ("neighbours", "points", *OF_SCALE, "prior", "prior_map", "space", "steps", "seed")
 #: Memory that one process of the bundled prior takes at 640x480, bytes; what a larger prior takes is unknown.
 PROCESS_BYTES = 1.5e9
-#: Depth maps of other models, in the order in which they are looked for.
-MAPS = (".npy", ".npz", ".pfm", ".png")
 
 
 def open_capture(options: CaptureOptions) -> Capture:
@@ -165,8 +163,7 @@ def _depth(
     """Depth of one frame as the options say."""
     call: dict[str, Any] = {} if options.steps is None else {"num_inference_steps": options.steps}
     if options.prior_map is not None:
-        paths = [options.prior_map / f"{name}{suffix}" for suffix in MAPS]
-        path = next((path for path in paths if path.is_file()), paths[0])
+        path = find_map(options.prior_map, name) or options.prior_map / f"{name}{MAP_SUFFIXES[0]}"
         call["depth_map"] = read_map(path, f"--prior-map of {name}")
     with torch.no_grad():
         return capture.depth(pipe, name, options.neighbours, seed=options.seed, points=points, **call)

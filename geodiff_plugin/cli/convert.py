@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.cli.converters import depthfm, ppd, read_checkpoint, save_weights
 from geodiff_plugin.cli.converters.marigold_v2 import MARIGOLD_V2, convert_marigold_v2
 
@@ -50,6 +50,8 @@ def run_convert(paths: Sequence[Path], part: str | None = None, space: str | Non
             kind = _convert_file(source, unfinished, part)
         unfinished.chmod(0o755)  # mkdtemp's is its owner's alone
         os.replace(unfinished, target)
+    except InputError:
+        raise
     except (KeyError, RuntimeError, AttributeError, TypeError) as error:  # of networks that it does not fit
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         bad_value("SRC", "a whole checkpoint of its kind", f"{source} ({reason})", "Fetch it anew.")

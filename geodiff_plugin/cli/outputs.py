@@ -15,6 +15,7 @@ from PIL import Image
 from geodiff_plugin.cli.inputs import Inputs
 from geodiff_plugin.cli.options import DepthOptions, told_apart
 from geodiff_plugin.formats import (
+    Cloud,
     flying_points,
     make_cloud,
     write_colmap,
@@ -228,17 +229,24 @@ def cameras_of(
     return ((K, np.eye(4), (depth_m.shape[1], depth_m.shape[0])), *rights)
 
 
+def cloud_of(output: MetricDepthOutput, left: np.ndarray, least_confidence: float) -> Cloud:
+    """Points of at least this confidence, without those that hang between two surfaces, in ``left``'s colours."""
+    depth_m = single_map(output.prediction)
+    keep = ~flying_points(depth_m)
+    if output.confidence is not None:
+        keep &= single_map(output.confidence) >= least_confidence
+    return make_cloud(depth_m, left, np.asarray(output.K)[0].astype(np.float64), keep)
+
+
 def write_exports(folder: Path, output: MetricDepthOutput, inputs: Inputs, options: DepthOptions) -> None:
     """Write what ``--export`` asks for, into a folder with the maps.
 
-    The cloud has points of at least the least confidence, without those that hang between two surfaces. The
-    images of a COLMAP model are the photographs, or where lens distortion was taken out written here.
+    The images of a COLMAP model are the photographs, or written here where lens distortion was taken out.
     """
-    depth_m, cameras = single_map(output.prediction), cameras_of(output, inputs.guidance)
-    keep = ~flying_points(depth_m)
-    if output.confidence is not None:
-        keep &= single_map(output.confidence) >= options.min_confidence
-    cloud = make_cloud(depth_m, inputs.left, cameras[0][0], keep)
+    cloud, cameras = (
+        cloud_of(output, inputs.left, options.min_confidence),
+        cameras_of(output, inputs.guidance),
+    )
     if "glb" in options.export:
         write_glb(folder / "cloud.glb", cloud, cameras)
     if "colmap" in options.export:

@@ -18,7 +18,7 @@ from PIL import Image
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.options import DepthOptions, check_files, told_apart
 from geodiff_plugin.cli.terminal import say
-from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.files import MAP_SUFFIXES, check_file, find_map
 from geodiff_plugin.formats.out import check_out
 from geodiff_plugin.formats.recordings import VIDEOS, count_frames, is_bag, is_video, list_pairs
 
@@ -26,8 +26,6 @@ from geodiff_plugin.formats.recordings import VIDEOS, count_frames, is_bag, is_v
 SUMMARY = "pairs.csv"
 COLUMNS = ("pair", "result", "near_m", "median_m", "far_m", "verdict", "confidence", "seconds", "message")
 LISTS = (".csv", ".tsv", ".txt")
-#: Files of maps, the first of a name is taken.
-MAPS = (".npy", ".npz", ".pfm", ".png")
 
 
 @dataclass(frozen=True)
@@ -106,9 +104,8 @@ def options_of(ref: PairRef, options: DepthOptions) -> DepthOptions:
     prior_map = options.prior_map
     if prior_map is not None:
         stem = ref.left.stem if ref.frame is None else ref.name
-        paths = [prior_map / f"{stem}{suffix}" for suffix in MAPS]
-        got = f"{prior_map} without {stem}{{{','.join(MAPS)}}}"
-        prior_map = next((path for path in paths if path.is_file()), None)
+        got = f"{prior_map} without {stem}{{{','.join(MAP_SUFFIXES)}}}"
+        prior_map = find_map(prior_map, stem)
         if prior_map is None:
             bad_value("--prior-map", "a folder with a map for each left image, of its name", got)
     assert options.out is not None  # a run over pairs has a folder

@@ -51,6 +51,8 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
     return file
 
 
+#: Suffixes of depth maps, in the order in which ``find_map`` looks for them.
+MAP_SUFFIXES = (".npy", ".npz", ".pfm", ".png")
 #: What Pillow raises at a damaged file.
 DECODE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, KeyError, EOFError, zlib.error)
 
@@ -81,6 +83,12 @@ def open_image(path: str | os.PathLike[str], name: str, what: str = "an image fi
     except (Image.DecompressionBombError, *DECODE_ERRORS) as error:
         cure = "Is it cut off, or too large?"
         bad_value(name, "a whole image file", f"{file}, which does not decode ({error})", cure)
+
+
+def find_map(folder: Path, stem: str) -> Path | None:
+    """The first map of a name in a folder, whatever its suffix; ``None`` where there is none."""
+    paths = (folder / f"{stem}{suffix}" for suffix in MAP_SUFFIXES)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def upright_size(path: str | os.PathLike[str], name: str) -> tuple[int, int]:
