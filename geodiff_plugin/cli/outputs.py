@@ -230,7 +230,7 @@ def cameras_of(
 
 
 def cloud_of(output: MetricDepthOutput, left: np.ndarray, least_confidence: float) -> Cloud:
-    """Points of at least this confidence, without those that hang between two surfaces, in ``left``'s colours."""
+    """Points of at least this confidence in the colours of ``left``, without flying points."""
     depth_m = single_map(output.prediction)
     keep = ~flying_points(depth_m)
     if output.confidence is not None:
