@@ -13,7 +13,7 @@ import torch
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin._threads import available_cores
-from geodiff_plugin.capture.options import NEIGHBOURS
+from geodiff_plugin.capture.options import NEIGHBOURS, POINTS
 from geodiff_plugin.formats.captures import CaptureFiles, CaptureFrame, read_capture
 from geodiff_plugin.formats.depth import read_depth_png
 from geodiff_plugin.formats.images import read_image
@@ -25,6 +25,8 @@ from geodiff_plugin.types import MetricDepthOutput
 
 #: Shares of red, green and blue in grey.
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
+#: A solve that moved the given poses, or estimated them; its points count from this many frames on.
+ADJUSTED, FEWEST_FRAMES = ("solved", "estimated"), 3
 #: What 7-Scenes writes where depth is unknown.
 NO_DEPTH = 65535
 #: Angle of two rays that a match is worth most at, degrees, and how fast it is worth less below and above it.
@@ -185,7 +187,7 @@ class Capture:
         i, rights = self._number[name], [self._number[other] for other in names]
         views: list[tuple[Any, ...]] = [(None, solved.K[i], np.eye(4))]
         views += [(self.image(self.names[j]), solved.K[j], solved.pose(i, j)) for j in rights]
-        settings = {"pose": "given"} if solved.status in ("solved", "estimated") else {}
+        settings = {"pose": "given"} if solved.status in ADJUSTED else {}
         size = self.frame(name).size
         return GeometryGuidance.from_views(views, left_size=size, unit=self.unit, **settings | knobs)
 
@@ -195,10 +197,12 @@ class Capture:
         Raises:
             InputError: a capture without such points, or without a unit.
         """
-        check_choice(points, "points", ("none", "model", "depth"))
+        check_choice(points, "points", POINTS)
         frame = self.frame(name)
         if points == "none":
             return None
+        if points == "tracks":
+            return self._tracked(self._number[frame.name])
         if self.unit is None:
             cure = "Give --metres-per-unit, --known-length or --distance."
             bad_value("points", "of a capture whose scale is known", "one without a unit", cure)
@@ -212,6 +216,19 @@ class Capture:
             return None
         T = np.linalg.inv(frame.E)
         return (frame.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+
+    def _tracked(self, number: int) -> np.ndarray | None:
+        """``(n, 3)`` points of the solve in a frame's camera, those on which at least three frames agree."""
+        solved = self.solve()
+        if solved.status not in ADJUSTED or not solved.connected[number]:
+            return None
+        frames = np.bincount(
+            np.concatenate([seen.point for seen in solved.seen]), minlength=len(solved.points)
+        )
+        xyz, T = solved.points[solved.seen[number].point], np.linalg.inv(solved.E[number])
+        xyz = xyz[frames[solved.seen[number].point] >= FEWEST_FRAMES] @ T[:3, :3].T + T[:3, 3]
+        ahead = xyz[xyz[:, 2] > 0].astype(np.float32)
+        return ahead if len(ahead) else None
 
     def measured_depth(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """The depth map that the capture names for a frame: ``(h, w)`` metres, and where it is known."""
@@ -228,7 +245,7 @@ class Capture:
         neighbours: Sequence[str] | int = NEIGHBOURS,
         *,
         seed: int = 0,
-        points: str = "none",
+        points: str = "tracks",
         knobs: dict[str, Any] | None = None,
         **call: Any,
     ) -> MetricDepthOutput:
@@ -239,8 +256,8 @@ class Capture:
             name: of the frame.
             neighbours: names, or how many are chosen.
             seed: of the noise.
-            points: known depths, ``"none"``, ``"model"`` (points of a COLMAP model) or ``"depth"`` (the map
-                that the capture names for the frame).
+            points: known depths: ``"tracks"`` (points of the solve, where that moved the poses), ``"none"``,
+                ``"model"`` (points of a COLMAP model) or ``"depth"`` (the map that the capture names).
             knobs: further arguments of ``GeometryGuidance``.
             **call: further arguments of the pipeline's call.
         """

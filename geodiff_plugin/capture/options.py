@@ -14,6 +14,8 @@ from geodiff_plugin.options import CAMERAS, OUTPUT, PriorOptions, check_options,
 
 #: Right views of a frame, at most.
 NEIGHBOURS = 5
+#: Known depths of the frames.
+POINTS = ("tracks", "none", "model", "depth")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,9 +43,10 @@ class CaptureOptions(PriorOptions):
         choices=("refined", "given"),
     )
     points: str = declare(
-        "none",
-        "Known depths: none, model (points of a COLMAP model), depth (maps it names).",
-        choices=("none", "model", "depth"),
+        "tracks",
+        "Known depths: tracks (points of the pose solve), none, model (points of a COLMAP model), depth "
+        "(maps it names).",
+        choices=POINTS,
     )
     metres_per_unit: float | None = declare(
         None, "Length of one unit of the poses, metres.", panel=CAMERAS, above_0="metres"
