@@ -57,7 +57,6 @@ def _known(depth_m: np.ndarray) -> np.ndarray:
 def depth_range(depth_m: Any, near: float | None = None, far: float | None = None) -> tuple[float, float]:
     """The depths at the two ends of the colours, ``0 < near < far`` in metres; by default 2 % lie beyond.
 
-    ``depth_m`` is ``(H, W)`` metres, numpy or torch; pixels that are not finite or not above 0 never count.
     ``ValueError`` for a given end that is not above 0 and finite, or ``near >= far``.
     """
     for name, value in (("near", near), ("far", far)):
@@ -79,10 +78,7 @@ def depth_range(depth_m: Any, near: float | None = None, far: float | None = Non
 
 
 def ticks(near: float, far: float, most: int = 8) -> list[float]:
-    """At most ``most`` rising round depths in ``[near, far]`` for a logarithmic scale, ``0 < near < far``.
-
-    They are 1, 2, 5 (or denser) times powers of ten over wide ranges, equal steps over narrow ones.
-    """
+    """At most ``most`` rising round depths in ``[near, far]`` for a logarithmic scale, ``0 < near < far``."""
     from matplotlib.ticker import MaxNLocator
 
     if far / near >= 4:
@@ -112,8 +108,7 @@ def _coloured(
 def colour_depth(depth_m: Any, near: float | None = None, far: float | None = None) -> np.ndarray:
     """``(H, W, 3)`` uint8 RGB of a depth map: near is yellow, far is dark blue, unknown is grey.
 
-    The colours go with the logarithm of depth, so that a step of colour is a step of relative depth, as in
-    AbsRel. Arguments and errors as for ``depth_range``; axes of length 1 are dropped.
+    The colours go with the logarithm of depth. Arguments and errors as for ``depth_range``.
     """
     near, far = depth_range(depth_m, near, far)
     depth_m = _as_map(depth_m)
@@ -178,7 +173,7 @@ def depth_figure(
 ) -> Image.Image:
     """A coloured depth map beside a colour bar, far on top; small maps are enlarged by a whole factor.
 
-    Arguments and errors are as for ``depth_range``; ``unit`` is ``"m"``, or ``None`` for a depth without one.
+    Arguments and errors as for ``depth_range``; ``unit`` is ``"m"``, or ``None`` for a depth without one.
     """
     near, far = depth_range(depth_m, near, far)
     marks = [(math.log(z / near) / math.log(far / near), f"{z:g}") for z in ticks(near, far)]
@@ -211,8 +206,8 @@ def grid(
 ) -> Image.Image:
     """A contact sheet: pictures side by side, each under its title, scaled to ``cell_width`` pixels.
 
-    Pictures are PIL images, or ``(H, W)`` or ``(H, W, 3)`` arrays of uint8, bool or floats in [0, 1]. A row,
-    of ``columns`` (all, up to 4), is as high as its highest. ``ValueError`` for none, or other titles.
+    Pictures are PIL images or arrays, as of matplotlib; a row, of ``columns`` (all, up to 4), is as high as
+    its highest. ``ValueError`` for none, or other titles.
     """
     pictures = [_as_picture(image) for image in images]
     if not pictures or len(titles) != len(pictures):
@@ -265,10 +260,9 @@ def depth_frames(
     far: float | None = None,
     unit: str | None = "m",
 ) -> Iterator[Image.Image]:
-    """One picture a depth map, all of one size and in the same colours; each is drawn when it is asked for.
+    """One picture a depth map ``(H, W)``, all in the same colours; each is drawn when it is asked for.
 
-    The maps are ``(H, W)`` metres (or of no ``unit``); ``near`` and ``far`` are as in ``depth_range``, over
-    all maps. ``ValueError`` for no maps, or maps of several shapes.
+    Ends as in ``depth_range``, over all maps. ``ValueError`` for no maps, or maps of several shapes.
     """
     shapes, samples = set(), []
     for depth_m in depths_m:  # one pass: a map may be read from its file whenever it is asked for

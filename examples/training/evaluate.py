@@ -16,7 +16,7 @@ from diffusers import MarigoldDepthPipeline
 from examples.training.data import held_out
 from examples.training.validate import contact_sheet, predict, score_scenes
 from geodiff_plugin.bundled import PRIOR_FOLDER, open_pipeline
-from geodiff_plugin.evaluation.datasets import load_pairs
+from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.metrics import align, evaluate_depth
 
 __all__ = ["best_constant", "best_plane", "main", "score_pairs"]
@@ -58,7 +58,7 @@ def score_pairs(
         One row a pair: ``dataset``, ``name``, ``prior``, ``delta1``, ``plane``, ``constant``.
     """
     rows = []
-    for sample in load_pairs(root):
+    for sample in map(load, find_pairs(root)):
         depth, valid = np.asarray(sample.depth_m), np.asarray(sample.valid)
         image = torch.from_numpy(np.ascontiguousarray(sample.left)).permute(2, 0, 1)[None].float() / 255.0
         prediction = predict(pipeline, image, steps, resolution)[0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -27,36 +26,29 @@ from geodiff_plugin.runner import Item, Record
 
 #: An error above this is of the kind that a wrong scale makes, and must be said.
 BY_A_FACTOR = 0.25
-
-
 #: Heading of a column -> references, and the pose that they are given.
 Columns = Mapping[str, tuple[Sequence[SampleRef], str]]
 
 
 def poses_table(title: str, columns: Mapping[str, Sequence[Record]], note: str) -> Table:
-    """AbsRel of the same pairs with their poses given in several ways, and what was said.
+    """AbsRel of the same pairs with their poses given in several ways, and how often nothing was said."""
 
-    A row a pair, then the means of all, of rectified and of posed pairs (of those with a result), then how
-    many have none, and how many are off by more than ``BY_A_FACTOR`` without a warning.
-    """
-    first = next(iter(columns.values()))
-    labels = list(map(label_of, first))
-    values = [dict(zip(labels, map(headline, records), strict=True)) for records in columns.values()]
-    rows = [(label, *(tables.cell(own[label]) for own in values)) for label in labels]
+    def mean(values: list[float | None], digits: int) -> str:
+        count = len(values) - values.count(None)
+        return tables.mean_cell(values, digits) + (f" of {count}" if 0 < count < len(values) else "")
 
-    def mean(own: Sequence[float | None]) -> str:
-        count = len(own) - own.count(None)
-        return tables.mean_cell(own) + (f" of {count}" if 0 < count < len(own) else "")
+    def silently_off(record: Record) -> bool:
+        off = (headline(record) or 0.0) > BY_A_FACTOR
+        return off and not record["notes"]["method"].get("warnings")
 
-    for group, members in tables.groups_of(first).items():
-        rows.append((f"mean of {group}", *(mean([own[x] for x in labels if x in members]) for own in values)))
-    rows.append(("without a result", *(str(list(own.values()).count(None)) for own in values)))
-    unwarned = [
-        sum((headline(r) or 0.0) > BY_A_FACTOR and not r["notes"]["method"].get("warnings") for r in records)
-        for records in columns.values()
-    ]
-    rows.append((f"off by more than {BY_A_FACTOR:g}, no warning", *map(str, unwarned)))
-    return Table(title, ("pair", *columns), tuple(rows), note)
+    # Changed samples, in the same order, have other names.
+    names = [{"dataset": r["dataset"], "sample": r["sample"]} for r in next(iter(columns.values()))]
+    own = [[r | like for r, like in zip(records, names, strict=True)] for records in columns.values()]
+    table = tables.per_pair_table(title, zip(columns, own, strict=True), headline, 3, note, mean)
+    missing = (str(sum(headline(record) is None for record in records)) for records in own)
+    unwarned = (str(sum(map(silently_off, records))) for records in own)
+    more = ("without a result", *missing), (f"off by more than {BY_A_FACTOR:g}, no warning", *unwarned)
+    return replace(table, rows=(*table.rows, *more))
 
 
 def _residual(name: str, own: Sequence[Record]) -> str:
@@ -75,11 +67,7 @@ RESIDUAL_NOTE = "Median distance of the matches from their epipolar lines, pixel
 def run_poses(name: str, options: PosesOptions) -> Page | None:
     """Measure two views, three where there are some, rectified pairs drifted, and rendered ones perturbed."""
     change, drift = two_numbers(options.perturb, "--perturb"), two_numbers(options.drift, "--drift")
-    size = options.rendered_size
-    if size is not None and not re.fullmatch(r"\d{2,5}x\d{2,5}", size):
-        cure = "256x192 has a quarter of the usual pixels."
-        bad_value("--rendered-size", "WIDTHxHEIGHT in pixels", repr(size), cure)
-    real, rendered = real_and_rendered(options, "synthetic-posed:{}" + (f"@{size}" if size else ""))
+    real, rendered = real_and_rendered(options, "synthetic-posed")
     cells, notes = list[Item](), dict[str, str]()
 
     def add(kind: str, what: str, note: str, columns: Columns, views: int = 2) -> None:
@@ -141,7 +129,7 @@ def _moved(sample: StereoSample, centre: np.ndarray) -> StereoSample:
 
 
 def _scaled(sample: StereoSample, factor: float) -> StereoSample:
-    """Focal lengths of another size, and the principal point in the middle, where it says nothing."""
+    """Focal lengths of another size; the principal point stays in the middle, where it says nothing."""
     scale = np.diag((factor, factor, 1.0))
     return replace(sample, K_left=sample.K_left @ scale, K_right=sample.K_right @ scale)
 
@@ -163,6 +151,7 @@ def _as_it_is(sample: StereoSample, _: StereoSample) -> StereoSample:
     return sample
 
 
+#: Kind -> what it is, how a sample becomes so beside another one, and what true points are multiplied by.
 KINDS: dict[str, tuple[str, Change, float | None]] = {
     "right": ("right", _as_it_is, None),
     "right, points": ("right, points", _as_it_is, 1.0),
@@ -191,7 +180,6 @@ KINDS: dict[str, tuple[str, Change, float | None]] = {
     "points-mm": ("points in millimetres read as metres", _as_it_is, 1000.0),
     "points-3": ("points 3 times too far", _as_it_is, 3.0),
 }
-"""Kind -> what it is, how a sample becomes so beside another one, and what true points are multiplied by."""
 RIGHT = [kind for kind in KINDS if kind.startswith("right")]
 WRONG = [kind for kind in KINDS if kind not in RIGHT]
 
@@ -277,7 +265,7 @@ def run_trust(name: str, options: TrustOptions) -> Page | None:
         check_choice(kind, "--kinds", WRONG)
     wrong = options.kinds or WRONG
     right = RIGHT if any(KINDS[kind][2] for kind in wrong) else RIGHT[:1]
-    pairs = real_and_rendered(options, f"synthetic:{{}}@{options.width}x{options.width * 3 // 4}")
+    pairs = real_and_rendered(options, "synthetic")
     if "unrelated" in options.kinds and any(len(refs) == 1 for refs in pairs):
         bad_value("--kinds", "without 'unrelated' where a pair is alone", "it", "Give two pairs or more.")
     settings, priors, read = options.settings, PriorCache(), lru_cache(maxsize=2)(load)

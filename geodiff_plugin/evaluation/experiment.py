@@ -1,7 +1,6 @@
 """An experiment: cells (samples x methods x settings), each measured once, and tables of their records.
 
-The cells of every command are the items of one ``Runner``, so that all of them resume, are shared by several
-processes and report failures in the same way.
+The cells of every command are the items of one ``Runner``: all resume and are shared by several processes.
 """
 
 from __future__ import annotations
@@ -23,11 +22,8 @@ import cv2
 import torch
 
 from geodiff_plugin import __version__
-from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.baselines import Method, NotApplicable, PriorCache, Settings, find_method
-from geodiff_plugin.evaluation.baselines.unguided import map_name
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample, load
-from geodiff_plugin.evaluation.metrics import crop_mask
 from geodiff_plugin.evaluation.options import command_line
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.evaluation.tables import Table
@@ -93,8 +89,8 @@ def run_experiment(
 ) -> Page | None:
     """Measure the cells that have no record yet, and write the page; ``None`` in any process but the first.
 
-    The payload of each cell is a ``partial`` that returns the body of its record. Tables, and remarks above
-    them, are of the records of all cells, in order. ``ValueError`` or ``OSError`` for bad options or samples.
+    The payload of each cell is a ``partial`` that returns the body of its record. ``ValueError`` or
+    ``OSError`` for bad options or samples.
     """
     records = measure_cells(cells, options, journal or f"{command}.jsonl")
     return None if records is None else write_page(command, options, title, tables(records), remarks(records))
@@ -122,19 +118,10 @@ def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NA
 def cell_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior: str = "") -> str:
     """Name of a result: the same inputs give the same key, anything else another.
 
-    Not where a sample's files lie but what is in them counts. ``prior`` is its name and fingerprint.
+    What is in a sample's files counts, not where they lie. ``prior`` is its name and fingerprint.
     """
     files = {name: value for name, value in ref.files.items() if value is not None}
     return fingerprint(method, configuration, prior, __version__, ref.dataset, ref.name, files)
-
-
-@lru_cache(maxsize=1)
-def cropped(sample: StereoSample, crop: str) -> StereoSample:
-    """The sample with the truth inside of a crop only; images and cameras stay whole."""
-    valid = sample.valid & crop_mask(crop, sample.valid.shape)
-    if not valid.any():
-        bad_value(f"the truth of {sample.label}", f"known somewhere in the crop {crop}", "unknown there")
-    return sample if crop == "none" else replace(sample, valid=valid)
 
 
 def _measure(
@@ -143,7 +130,6 @@ def _measure(
     method: Method,
     settings: Settings,
     priors: PriorCache,
-    crop: str,
     path: Path | None,
 ) -> Record:
     """Run one method on one sample and score it; the seconds are those that the method takes alone."""
@@ -157,7 +143,7 @@ def _measure(
         return {"rectified": sample.rectified, "status": "not applicable", "reason": str(reason)} | process
     seconds = time.perf_counter() - start + priors.evidence.take_spared_seconds()
     cost = {"seconds": round(seconds, 3), "peak_bytes": memory.peak_bytes}
-    scores = score(cropped(sample, crop), prediction, DATASETS[sample.dataset].cap_m)
+    scores = score(sample, prediction, DATASETS[sample.dataset].cap_m)
     notes: dict[str, Any] = {"notes": {"sample": dict(sample.notes), "method": dict(prediction.notes)}}
     if path is not None and prediction.depth_m is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -175,22 +161,16 @@ def _has_map(cell: Item, record: Record) -> bool:
 
 
 def method_cells(
-    refs: Sequence[SampleRef],
-    methods: Sequence[str],
-    settings: Settings,
-    out: Path,
-    *,
-    crop: str = "none",
-    save_depth: bool = False,
+    refs: Sequence[SampleRef], methods: Sequence[str], settings: Settings, out: Path, save_depth: bool = False
 ) -> list[Item]:
     """A cell for every method on every sample, all of ``RECORDS_NAME``.
 
     With ``save_depth`` metres go to ``out/depth/<method>/<dataset>_<sample>.npy``; a record without its map
-    is made again. Its ``status`` is ``"ok"``, ``"not applicable"`` (``reason``) or ``"broken"`` (``error``).
+    is made again. ``status`` is ``"ok"``, ``"not applicable"`` (``reason``) or ``"broken"`` (``error``).
     """
     # One sample, read once, serves all its methods.
     process, priors, read = this_process(), PriorCache(), lru_cache(maxsize=1)(load)
-    several, cropping = process.count > 1, {} if crop == "none" else {"crop": crop}
+    several = process.count > 1
     if several and settings.device == "cuda":
         settings = replace(settings, device=f"cuda:{process.local % torch.cuda.device_count()}")
     cells = []
@@ -198,10 +178,10 @@ def method_cells(
         chosen = method.own_settings(settings)
         prior = f"{chosen.prior} {priors.fingerprint(chosen)}" if method.uses_prior else ""
         device = chosen.device.partition(":")[0] if several else chosen.device
-        configuration = method.configuration(replace(chosen, device=device)) | cropping
+        configuration = method.configuration(replace(chosen, device=device))
         folder = out / "depth" / re.sub(r"[^\w.=+-]+", "_", method.name)
-        path = folder / f"{map_name(ref.dataset, ref.name)}.npy" if save_depth else None
-        work = partial(_measure, ref, read, method, chosen, priors, crop, path=path)
+        path = folder / f"{ref.dataset}_{ref.name}.npy" if save_depth else None
+        work = partial(_measure, ref, read, method, chosen, priors, path=path)
         head = {"dataset": ref.dataset, "sample": ref.name, "method": method.name}
         key, name = cell_key(ref, method.base_name, configuration, prior), f"{ref.label}, {method.name}"
         cells.append(Item(key, work, name=name, words=(method.name,), head=head))

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import check_choice
 from geodiff_plugin.algorithm.terms import masked_mean, photometric_map
+from geodiff_plugin.capture.agreement import DepthFrame, seen_in
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load
 from geodiff_plugin.evaluation.datasets.sample import changed_ref
@@ -31,14 +32,13 @@ from geodiff_plugin.evaluation.scoring import in_metres
 from geodiff_plugin.evaluation.tables import ValueOf, count_of_pairs, grouped, headline, mean_with_interval
 from geodiff_plugin.formats import as_image_01, atomic_path
 from geodiff_plugin.formats.out import write_text
-from geodiff_plugin.geometry import project, resize_intrinsics, transform, unproject, warp_right_to_left
+from geodiff_plugin.geometry import resize_intrinsics, warp_right_to_left
 from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, grid, rasterised, ticks
 from geodiff_plugin.runner import Record
 from geodiff_plugin.scale.space import SPACES, smooth_floor
 
 #: A picture or a figure of matplotlib, and what it shows as JSON values.
 Drawing = tuple[Any, dict[str, Any]]
-DPI = 90
 #: Colours of lines, in order (Okabe and Ito's, distinguishable for the colour-blind), and their markers.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MARKERS = "osD^vP"
@@ -50,7 +50,7 @@ PRESETS = ("guided", "paper")
 
 def _new_figure(width_in: float, height_in: float) -> Any:
     """An empty figure that lays itself out; it belongs to no global state."""
-    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+    return Figure(figsize=(width_in, height_in), dpi=90, layout="constrained")
 
 
 def _save_png(picture: Any, path: Path) -> None:
@@ -105,21 +105,27 @@ def _curves(
     return drawn
 
 
+def _two_panels(refs: Sequence[SampleRef], **how: Any) -> tuple[Any, Any, dict[str, Any]]:
+    """A figure of the samples, its two axes, and the samples as JSON values."""
+    figure = _new_figure(7.6, 3.1)
+    figure.suptitle(count_of_pairs(len(refs)), fontsize=9)
+    return figure, figure.subplots(1, 2, **how), {"samples": [ref.label for ref in refs]}
+
+
 def draw_inner_steps(options: FigureOptions) -> Drawing:
     """Error and seconds against updates per denoising step, for both presets."""
     updates, refs = sorted(set(options.updates)), select(options)
     methods = {preset: [f"{preset}:inner_steps={n}" for n in updates] for preset in PRESETS}
     records = grouped(_records(options, refs, list(chain(*methods.values()))), "method")
     groups = {preset: [records.get(name, []) for name in names] for preset, names in methods.items()}
-    figure, numbers = _new_figure(7.6, 3.1), {"samples": [ref.label for ref in refs], "updates": updates}
-    panels = figure.subplots(1, 2)
+    figure, panels, numbers = _two_panels(refs)
     errors = _curves(panels[0], updates, groups, headline)
     seconds = _curves(panels[1], updates, groups, itemgetter("seconds"))
     for axes, title in zip(panels, ("AbsRel", "seconds a pair"), strict=True):
         _name_axes(axes, "updates per denoising step", title, updates)
         axes.set_ylim(bottom=0)
     panels[1].legend(fontsize=8)
-    figure.suptitle(count_of_pairs(len(refs)), fontsize=9)
+    numbers["updates"] = updates
     return figure, numbers | {p: {"abs_rel": errors[p], "seconds": seconds[p]} for p in PRESETS}
 
 
@@ -136,8 +142,7 @@ def draw_exposure(options: FigureOptions) -> Drawing:
         keys = [(method, ref.dataset, ref.name) for ref in exposed[change]]
         return [record for key in keys for record in of_sample.get(key, [])]
 
-    figure, numbers = _new_figure(7.6, 3.1), dict[str, Any](samples=[ref.label for ref in refs])
-    panels, drawn = figure.subplots(1, 2, sharey=True), list[float]()
+    drawn, (figure, panels, numbers) = list[float](), _two_panels(refs, sharey=True)
     for axes, (name, values) in zip(panels, changes.items(), strict=True):
         groups = {method: [of_change(method, change) for change in values] for method in methods}
         curves = _curves(axes, GAINS, groups, headline)
@@ -147,49 +152,7 @@ def draw_exposure(options: FigureOptions) -> Drawing:
     if drawn:  # errors of good and bad methods are decades apart
         _plain_log_axis(panels[0].yaxis, min(drawn), max(drawn))
     panels[0].legend(fontsize=8)
-    figure.suptitle(count_of_pairs(len(refs)), fontsize=9)
     return figure, numbers
-
-
-LIGHT = np.array([-0.4, -0.5, 0.77])
-
-
-def shaded(depth_m: np.ndarray, focal_px: float) -> np.ndarray:
-    """``(H, W)`` in [0, 1]: the surface lit from the upper left, so that roughness shows."""
-    rows, columns = np.gradient(np.log(np.maximum(depth_m, 1e-6)))
-    normal = np.stack([-columns * focal_px, -rows * focal_px, np.ones_like(rows)], -1)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    return np.clip(normal @ LIGHT, 0.0, 1.0)
-
-
-def draw_strength(
-    records: Sequence[Record], oracle: str, pictures: Mapping[str, np.ndarray], path: Path
-) -> None:
-    """Write the PNG of ``geodiff eval strength``: errors against that of the method ``oracle``.
-
-    ``pictures`` are shaded crops by their titles.
-    """
-    figure = _new_figure(11.0, 4.4)
-    parts = figure.add_gridspec(2, 4)
-    axes = figure.add_subplot(parts[:, :2])
-    groups = grouped(records, "method", "strength").items()
-    errors = {key: float(np.mean([record["abs_rel"] for record in own])) for key, own in groups}
-    at = {strength: error for (method, strength), error in errors.items() if method == oracle}
-    ordered = sorted(at, key=at.__getitem__)
-    for index, method in enumerate(dict.fromkeys(method for method, _ in errors if method != oracle)):
-        means = [errors[method, strength] for strength in ordered]
-        axes.plot([at[s] for s in ordered], means, label=find_method(method).title, **_style(index))
-    ends = (min(at.values()) * 0.8, max(at.values()) * 1.2)
-    axes.plot(ends, ends, color="0.6", linestyle="--", linewidth=1, label=find_method(oracle).title)
-    axes.set(xscale="log", yscale="log")
-    _name_axes(axes, "AbsRel of the prior, aligned by an oracle", "AbsRel in metres")
-    axes.legend(fontsize=8)
-    for k, (title, picture) in enumerate(pictures.items()):
-        panel = figure.add_subplot(parts[k // 2, 2 + k % 2])
-        panel.imshow(picture, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-        panel.set_title(title, fontsize=8)
-        panel.set_axis_off()
-    _save_png(figure, path)
 
 
 #: Candidates, as many as the one-number search of the paper preset has; weight of SSIM; pictures shown.
@@ -201,9 +164,9 @@ def sweep_g_s(
 ) -> tuple[dict[str, np.ndarray], dict[int, np.ndarray]]:
     """Scale a relative map ``(H, W)``, affine in ``space``, by candidates from 1 m to ``largest_m`` (S7.3).
 
-    Without shift; a map that falls with depth gets that of raw scale and shift 0. Returned are ``(M,)`` each:
-    ``g_s_m`` metres, ``loss`` (Eq. 14) over the ``visible`` share of pixels (docs/reference/paper-map.md,
-    E8), ``abs_rel``; and by index some ``(H, W, 3)`` left images in [0, 1], re-rendered from the right one.
+    Without shift; a map that falls with depth gets that of raw scale and shift 0. ``(M,)`` each: ``g_s_m``
+    metres, ``loss`` (Eq. 14) over the ``visible`` share of pixels (docs/reference/paper-map.md, E8),
+    ``abs_rel``; and by index some left images in [0, 1], re-rendered from the right one.
     """
     left, right = (as_image_01(image, "image")[None] for image in (sample.left, sample.right))
     matrices = (sample.K_left, sample.K_right, np.linalg.inv(sample.E))
@@ -268,7 +231,6 @@ def draw_gs_sweep(options: FigureOptions) -> Drawing:
     return figure, {"sample": sample.label} | {name: values.tolist() for name, values in sweep.items()}
 
 
-YAW_DEGREES, PITCH_DEGREES = -25.0, 12.0
 #: A picture of points is drawn this much smaller than the map that they come from, which closes its holes.
 SHRINK = 0.6
 #: The largest relative error that has a colour of its own.
@@ -278,7 +240,7 @@ WORST_SHOWN = 0.5
 def orbit(centre_m: float) -> np.ndarray:
     """``T_view_from_left`` ``(4, 4)`` of a camera that swung left and up around a point on the axis."""
     T, centre = np.eye(4), np.array([0.0, 0.0, centre_m])
-    T[:3, :3] = Rotation.from_euler("yx", [YAW_DEGREES, PITCH_DEGREES], degrees=True).as_matrix()
+    T[:3, :3] = Rotation.from_euler("yx", [-25.0, 12.0], degrees=True).as_matrix()
     T[:3, 3] = centre - T[:3, :3] @ centre
     return T
 
@@ -287,23 +249,17 @@ def render_cloud(
     depth_m: np.ndarray, image: np.ndarray, K: np.ndarray, T_view_from_left: np.ndarray
 ) -> np.ndarray:
     """Points of a depth map, in the colours of its image, from another camera: uint8, ``SHRINK`` as large."""
-    height, width = depth_m.shape
-    size = (round(height * SHRINK), round(width * SHRINK))
-    known = np.isfinite(depth_m) & (depth_m > 0)
-    z_left = torch.from_numpy(np.where(known, depth_m, 1.0).astype(np.float32))[None, None]
-    K_left, T = (torch.from_numpy(matrix.astype(np.float32))[None] for matrix in (K, T_view_from_left))
-    points = transform(unproject(z_left, K_left), T)
-    uv, z = project(points, resize_intrinsics(K_left, (height, width), size))
-    at = uv.round().long().view(-1, 2)
-    inside = (at >= 0).all(1) & (at[:, 0] < size[1]) & (at[:, 1] < size[0])
-    keep = inside & torch.from_numpy(known).view(-1)
-    target, z = (at[:, 1] * size[1] + at[:, 0])[keep], z.view(-1)[keep]
-    colours = torch.from_numpy(np.ascontiguousarray(image)).view(-1, 3)[keep]
+    size = round(depth_m.shape[0] * SHRINK), round(depth_m.shape[1] * SHRINK)
+    K_view = resize_intrinsics(torch.from_numpy(K)[None], depth_m.shape, size)[0].numpy()
+    empty, E_view = np.empty(size), np.linalg.inv(T_view_from_left)
+    depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.nan)
+    left, view = DepthFrame("", depth_m, depth_m, K, np.eye(4)), DepthFrame("", empty, empty, K_view, E_view)
+    row, column, z, inside = seen_in(left, view)
     # Far to near, and a stable sort: the last point written into a pixel is its nearest one.
-    order = torch.argsort(z, descending=True, stable=True).numpy()
-    picture = np.full((size[0] * size[1], 3), 255, np.uint8)
-    picture[target.numpy()[order]] = colours.numpy()[order]
-    return picture.reshape(*size, 3)
+    order = np.argsort(-z[inside], kind="stable")
+    picture = np.full((*size, 3), 255, np.uint8)
+    picture[row[inside][order], column[inside][order]] = image[inside][order]
+    return picture
 
 
 def _answer(
@@ -354,6 +310,7 @@ def draw_side_by_side(shown: Sequence[str], options: FigureOptions) -> Drawing:
     return grid(cells, titles, columns=1 + len(methods)), {"abs_rel": numbers}
 
 
+#: Every figure by name.
 FIGURES: dict[str, Callable[[FigureOptions], Drawing]] = {
     "gs-sweep": draw_gs_sweep,
     "inner-steps": draw_inner_steps,
@@ -361,7 +318,6 @@ FIGURES: dict[str, Callable[[FigureOptions], Drawing]] = {
     "exposure": draw_exposure,
     "qualitative": partial(draw_side_by_side, ("prior-aligned", "paper", "sweep-sgm", "guided")),
 }
-"""Every figure by name."""
 
 
 def run_figure(name: str, options: FigureOptions) -> Path:

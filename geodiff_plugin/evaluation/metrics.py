@@ -13,17 +13,17 @@ import torch
 from scipy import ndimage
 
 from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.evaluation.options import CROPS
 from geodiff_plugin.scale.space import SPACES
 
+#: ``(H, W)``, or of some of its pixels.
+Map = np.ndarray
+#: Nearest truth that counts and nearest value of a prediction, metres (Marigold's evaluation of KITTI).
 FLOOR_M = 1e-5
-"""Nearest truth that counts and nearest value of a prediction, metres (Marigold's evaluation of KITTI)."""
+#: Aligned disparity, 1/m, is clipped here before it is inverted: nothing is farther than a kilometre.
 MIN_DISPARITY = 1e-3
-"""Aligned disparity, 1/m, is clipped here before it is inverted: nothing is farther than a kilometre."""
-
 #: Metric of depths ``(p, t)``, metres, of the pixels with both. The deltas are the shares of max(p/t, t/p)
 #: below 1.25**k; the RMSE is rooted, the logarithms are natural, SILog is 100 times a standard deviation.
-DEPTH_METRICS: dict[str, Callable[[np.ndarray, np.ndarray], np.floating]] = {
+DEPTH_METRICS: dict[str, Callable[[Map, Map], np.floating]] = {
     "abs_rel": lambda p, t: np.mean(np.abs(p - t) / t),
     "delta1": lambda p, t: np.mean(np.maximum(p / t, t / p) < 1.25),
     "delta2": lambda p, t: np.mean(np.maximum(p / t, t / p) < 1.25**2),
@@ -34,7 +34,7 @@ DEPTH_METRICS: dict[str, Callable[[np.ndarray, np.ndarray], np.floating]] = {
 }
 #: Metric of disparity errors ``e`` and truths ``t``, pixels, and the threshold that it has. Bad-k is a share
 #: of pixels; D1 is KITTI's: above 3 px and above 5 % of the truth.
-DISPARITY_METRICS: dict[str, tuple[float, Callable[[np.ndarray, np.ndarray], np.floating]]] = {
+DISPARITY_METRICS: dict[str, tuple[float, Callable[[Map, Map], np.floating]]] = {
     "epe": (np.inf, lambda e, t: np.mean(e)),
     "bad1": (1, lambda e, t: np.mean(e > 1)),
     "bad2": (2, lambda e, t: np.mean(e > 2)),
@@ -43,34 +43,30 @@ DISPARITY_METRICS: dict[str, tuple[float, Callable[[np.ndarray, np.ndarray], np.
 }
 
 
-def _check_maps(**maps: np.ndarray) -> None:
-    if len({np.shape(values) for values in maps.values()}) != 1:
-        shapes = ", ".join(f"{name} {np.shape(values)}" for name, values in maps.items())
-        bad_value("maps", "of one shape (H, W)", shapes)
+def answered(pred_m: Map) -> Map:
+    """``(H, W)`` bool: where a map in metres has no hole."""
+    return np.isfinite(pred_m) & (pred_m > 0)
 
 
-def counted(truth_m: np.ndarray, valid: np.ndarray, cap_m: float | None = None) -> np.ndarray:
+def counted(truth_m: Map, valid: Map, cap_m: float | None = None) -> Map:
     """``(H, W)`` bool: pixels whose truth is known and between ``FLOOR_M`` and any cap; at least one."""
-    _check_maps(truth_m=truth_m, valid=valid)
     kept = valid & np.isfinite(truth_m) & (truth_m > FLOOR_M) & (True if cap_m is None else truth_m < cap_m)
     if not kept.any():
         bad_value("truth", "known for at least one pixel", "no valid pixel", "Check the mask and the cap.")
     return kept
 
 
-def evaluate_depth(
-    pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, cap_m: float | None = None
-) -> dict[str, float]:
+def evaluate_depth(pred_m: Map, truth_m: Map, valid: Map, cap_m: float | None = None) -> dict[str, float]:
     """Errors of one depth map; truth from ``cap_m`` on is dropped, and predictions are clipped to it.
 
-    ``DEPTH_METRICS`` over the pixels with both truth and prediction, NaN where there is none; ``coverage``
-    (share of the truth's pixels with a prediction) and ``pixels`` (their number). ``ValueError`` where shapes
-    differ or no pixel has truth. Source: S5.1; Marigold's evaluation code for clipping and SILog.
+    ``DEPTH_METRICS``, NaN where no pixel has truth and prediction; ``coverage`` (share of the truth's pixels
+    with a prediction); ``pixels``, their number. ``ValueError`` where shapes differ or no pixel has truth.
     """
-    _check_maps(pred_m=pred_m, truth_m=truth_m)
+    if not pred_m.shape == truth_m.shape == valid.shape:
+        bad_value("maps", "of one shape (H, W)", f"{pred_m.shape}, {truth_m.shape}, {valid.shape}")
     kept = counted(truth_m, valid, cap_m)
     pred, truth = np.asarray(pred_m, np.float64)[kept], np.asarray(truth_m, np.float64)[kept]
-    filled = np.isfinite(pred) & (pred > 0)
+    filled = answered(pred)
     scores = {"coverage": float(filled.mean()), "pixels": float(kept.sum())}
     if not filled.any():
         return dict.fromkeys(DEPTH_METRICS, float("nan")) | scores
@@ -79,50 +75,35 @@ def evaluate_depth(
 
 
 def evaluate_disparity(
-    pred_px: np.ndarray, truth_px: np.ndarray, valid: np.ndarray, step_px: float = 0.0
+    pred_px: Map, truth_px: Map, valid: Map, step_px: float = 0.0
 ) -> dict[str, float | None]:
     """``DISPARITY_METRICS`` of a disparity map, pixels; NaN without a pixel with truth and prediction.
 
-    ``step_px`` is the distance between two neighbouring values that the truth can take: a metric whose
-    threshold is finer is ``None``. Source: KITTI 2015 development kit (D1), Middlebury (bad-k).
+    ``step_px`` lies between neighbouring values of the truth: a metric with a finer threshold is ``None``.
     """
-    _check_maps(pred_px=pred_px, truth_px=truth_px, valid=valid)
-    if not valid.any():
-        bad_value("truth", "known for at least one pixel", "no valid pixel")
-    pred, truth = np.asarray(pred_px, np.float64)[valid], np.asarray(truth_px, np.float64)[valid]
-    filled = np.isfinite(pred)
-    error, truth = np.abs(pred[filled] - truth[filled]), truth[filled]
+    error, truth = np.abs(pred_px - truth_px)[valid], truth_px[valid]
+    filled = np.isfinite(error)
+    error, truth = error[filled], truth[filled]
     return {
         name: None if step_px > limit else float(metric(error, truth)) if error.size else float("nan")
         for name, (limit, metric) in DISPARITY_METRICS.items()
     }
 
 
-def _remaining(error: np.ndarray, order: np.ndarray, steps: int) -> np.ndarray:
+def _remaining(error: Map, order: Map, steps: int) -> Map:
     """Mean error without the first ``k / steps`` of the pixels of an order, for every k."""
     cut = (np.arange(steps) * error.size) // steps
     return np.cumsum(error[order][::-1])[::-1][cut] / (error.size - cut)
 
 
-def ause(
-    pred_m: np.ndarray,
-    truth_m: np.ndarray,
-    valid: np.ndarray,
-    uncertainty: np.ndarray | None,
-    steps: int = 100,
-) -> float:
-    """Area under the sparsification error: how badly the uncertainty sorts pixels by their error.
+def ause(pred_m: Map, truth_m: Map, valid: Map, uncertainty: Map | None, steps: int = 100) -> float:
+    """Area under the sparsification error: how badly the uncertainty sorts pixels by their relative error.
 
-    The mean relative error without the share ``k / steps`` of the least certain pixels is compared with that
-    without the worst ones, and the difference is averaged over k. ``uncertainty`` is ``(H, W)``, any unit,
-    larger is less certain; ``None``: the mean over random ones.
-
+    ``uncertainty`` is ``(H, W)``, any unit, larger is less certain; ``None``: the mean over random ones.
     ``ValueError`` where no pixel has truth, prediction and uncertainty.
     Source: Ilg et al., "Uncertainty Estimates and Multi-Hypotheses Networks for Optical Flow", S5.
     """
-    known = truth_m if uncertainty is None else uncertainty
-    _check_maps(pred_m=pred_m, truth_m=truth_m, valid=valid, uncertainty=known)
-    kept = valid & np.isfinite(pred_m) & (pred_m > 0) & np.isfinite(known)
+    kept = valid & answered(pred_m) & (True if uncertainty is None else np.isfinite(uncertainty))
     if not kept.any():
         bad_value("uncertainty", "finite for at least one pixel with truth and prediction", "none")
     truth = np.asarray(truth_m, np.float64)[kept]
@@ -136,39 +117,34 @@ def ause(
 
 
 def confidence_deciles(
-    pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, confidence: np.ndarray, within: float
+    pred_m: Map, truth_m: Map, valid: Map, confidence: Map, within: float
 ) -> list[dict[str, float | None]]:
     """What a confidence in [0, 1], that the relative error is below ``within``, promises and what it keeps.
 
     Ten entries, from [0, 0.1) to [0.9, 1]: ``share`` of the pixels, mean ``promised``, ``kept`` (share of
     pixels within), ``abs_rel``; the last three ``None`` for an empty class.
     """
-    _check_maps(pred_m=pred_m, truth_m=truth_m, valid=valid, confidence=confidence)
-    used = valid & np.isfinite(pred_m) & (pred_m > 0)
+    used = valid & answered(pred_m)
     error, promised = np.abs(pred_m[used] - truth_m[used]) / truth_m[used], confidence[used]
     values = {"promised": promised, "kept": error < within, "abs_rel": error}
     decile, classes = np.minimum((promised * 10).astype(int), 9), list[dict[str, float | None]]()
-    for k in range(10):
-        inside = decile == k
+    for inside in (decile == k for k in range(10)):
         means = {name: float(np.mean(v[inside])) if inside.any() else None for name, v in values.items()}
         classes.append({"share": float(inside.mean()) if inside.size else 0.0, **means})
     return classes
 
 
-def to_space(depth_m: np.ndarray, space: str) -> np.ndarray:
+def to_space(depth_m: Map, space: str) -> Map:
     """Depths in metres, > 0, of any shape, in a key of ``SPACES``, float64: linear in a right prior."""
     return SPACES[space].inverse(torch.from_numpy(np.asarray(depth_m, np.float64))).numpy()
 
 
-def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str = "depth") -> np.ndarray:
-    """Depth in metres of ``values`` that are right up to scale and shift in a key of ``SPACES``.
+def align(values: Map, truth_m: Map, valid: Map, space: str = "depth") -> Map:
+    """Depth ``(H, W)`` in metres of ``values`` that are right up to scale and shift in a key of ``SPACES``.
 
-    Returns:
-        ``(H, W)`` float64, metres, at least ``FLOOR_M``, and at most a kilometre where values fall with
-        depth; not finite where ``values`` is not, nor anywhere if no pixel has both truth and prediction.
-
-    Source: Marigold's evaluation: ``least_square`` and ``least_square_disparity``, the latter over positive
-        predictions only and clipped at 1e-3; the other spaces likewise.
+    At least ``FLOOR_M``, at most a kilometre where values fall with depth; not finite where ``values`` is
+    not, nor anywhere if no pixel has truth and prediction. Source: Marigold's evaluation, ``least_square``
+    and ``least_square_disparity``, the latter over positive predictions only.
     """
     kind, metre = SPACES[check_choice(space, "space", SPACES)], torch.ones((), dtype=torch.float64)
     known = valid & np.isfinite(values) & (truth_m > 0)
@@ -186,37 +162,6 @@ def align(values: np.ndarray, truth_m: np.ndarray, valid: np.ndarray, space: str
     return np.maximum(kind.forward(x, metre).numpy(), FLOOR_M)
 
 
-#: Shares of the image: first and last row, first and last column.
-_SHARES = {"none": (0, 1, 0, 1), "garg": (0.40810811, 0.99189189, 0.03594771, 0.96405229)}
-_SHARES["eigen"] = (0.3324324, 0.91351351, 0.0359477, 0.96405229)
-#: Rows and columns that every image of KITTI's depth benchmark has.
-_BENCHMARK = (352, 1216)
-
-
-def crop_mask(name: str, size: tuple[int, int]) -> np.ndarray:
-    """``(H, W)`` bool: pixels of an image inside of a crop, one of ``CROPS``; methods still see whole images.
-
-    Of 375 x 1242 pixels, Garg's crop keeps rows 153 to 370 and columns 44 to 1196, Eigen's rows 124 to 341
-    and the same columns, the benchmark's rows 23 to 374 and columns 13 to 1228 (bottom, middle).
-
-    Source: Marigold's evaluation of KITTI, which follows BTS and monodepth. Deviation: Marigold's tables take
-        Eigen's crop of an image that was cut to the benchmark's before; here each stands alone.
-    """
-    check_choice(name, "crop", CROPS)
-    (height, width), (rows, columns), mask = size, _BENCHMARK, np.zeros(size, bool)
-    if name != "benchmark":
-        sides = zip(_SHARES[name], (height, height, width, width), strict=True)
-        top, bottom, left, right = (int(share * side) for share, side in sides)
-    elif height < rows or width < columns:
-        expected = f"'benchmark' for images of at least {columns} x {rows}"
-        bad_value("crop", expected, f"{width} x {height}", "It is for KITTI; leave --crop out.")
-    else:
-        top, bottom, left = height - rows, height, (width - columns) // 2
-        right = left + columns
-    mask[top:bottom, left:right] = True
-    return mask
-
-
 #: A step of the true disparity between neighbours that makes an edge, and how near it "edge" reaches, pixels.
 STEP_PX, REACH_PX = 3.0, 4
 #: Ratios of neighbouring depths that Depth Pro counts as boundaries; a threshold weighs as much as its size.
@@ -228,11 +173,8 @@ CANNY_SIGMA, CANNY_LOW, CANNY_HIGH, FARTHEST_PX = np.sqrt(2.0), 0.1, 0.2, 10.0
 LOG_STEP, NEAR_EDGE, OFF_EDGE = 0.08, 3, 5
 
 
-def near_disparity_steps(disparity_px: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """``(H, W)`` bool: pixels within ``REACH_PX`` of a step of the true disparity of more than ``STEP_PX``.
-
-    A step lies between two known neighbours of a row or a column.
-    """
+def near_disparity_steps(disparity_px: Map, valid: Map) -> Map:
+    """``(H, W)`` bool: pixels near a step of the true disparity between known neighbours."""
     step, known_px = np.zeros(valid.shape, bool), np.where(valid, disparity_px, np.nan)
     for near, px in ((step, known_px), (step.T, known_px.T)):
         apart = np.abs(np.diff(px)) > STEP_PX
@@ -241,11 +183,8 @@ def near_disparity_steps(disparity_px: np.ndarray, valid: np.ndarray) -> np.ndar
     return valid & step.any() & (ndimage.distance_transform_edt(~step) <= REACH_PX)
 
 
-def hidden_by_truth(disparity_px: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """``(H, W)`` bool: pixels of dense truth onto whose place in the right image a nearer one falls.
-
-    Nearer is by more than 1 px of disparity; pixels that fall beside the image are none.
-    """
+def hidden_by_truth(disparity_px: Map, valid: Map) -> Map:
+    """``(H, W)`` bool: pixels of dense truth onto whose place in the right image one nearer by 1 px falls."""
     target = np.rint(np.arange(valid.shape[1]) - np.where(valid, disparity_px, 0.0)).astype(int)
     rows, columns = np.nonzero(valid & (target >= 0) & (target < valid.shape[1]))
     shift, at = disparity_px[rows, columns], (rows, target[rows, columns])
@@ -255,7 +194,7 @@ def hidden_by_truth(disparity_px: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return hidden
 
 
-def _front_of(depth_m: np.ndarray, known: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def _front_of(depth_m: Map, known: Map) -> list[tuple[Map, Map]]:
     """Depth of the neighbour right, left, below, above over that of a pixel, and where both are known."""
     pairs = []
     for depth, there in ((depth_m, known), (depth_m.T, known.T)):
@@ -264,16 +203,13 @@ def _front_of(depth_m: np.ndarray, known: np.ndarray) -> list[tuple[np.ndarray, 
     return pairs
 
 
-def boundary_f1(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) -> float:
-    """How well the boundaries of a map, of any scale, lie where those of the truth lie.
-
-    Returns:
-        In [0, 1], 1 for truth with boundaries of all four directions itself; NaN where it has none.
+def boundary_f1(pred_m: Map, truth_m: Map, valid: Map) -> float:
+    """How well the boundaries of a map of any scale lie where the truth's lie, in [0, 1]; NaN for none.
 
     Source: Depth Pro, S3.2 and ``SI_boundary_F1``: F1 of foreground relations of neighbours, by four
-        directions, averaged over thresholds of their ratio. Deviation: masked, since our truth has holes.
+    directions, averaged over thresholds of their ratio. Deviation: masked, since our truth has holes.
     """
-    known = valid & np.isfinite(pred_m) & (pred_m > 0)
+    known = valid & answered(pred_m)
     pred, truth = (_front_of(np.where(known, m, 1.0).astype(np.float64), known) for m in (pred_m, truth_m))
     if not any((both & (ratio > RATIOS[0])).any() for ratio, both in truth):
         return float("nan")
@@ -290,7 +226,7 @@ def boundary_f1(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) -> f
     return float(total / RATIOS.sum())
 
 
-def _canny(depth_m: np.ndarray) -> np.ndarray:
+def _canny(depth_m: Map) -> Map:
     """``(H, W)`` bool: thin edges of a map without holes, scaled to [0, 1]."""
     span = max(float(np.ptp(depth_m)), 1e-12)
     smooth = ndimage.gaussian_filter((depth_m - depth_m.min()) / span, CANNY_SIGMA, mode="nearest")
@@ -307,22 +243,19 @@ def _canny(depth_m: np.ndarray) -> np.ndarray:
     return weak & np.isin(labels, np.unique(labels[strong]))
 
 
-def boundary_errors(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) -> dict[str, float]:
-    """Distances between the boundaries of a map, whose holes take the nearest depth, and those of the truth.
+def boundary_errors(pred_m: Map, truth_m: Map, valid: Map) -> dict[str, float]:
+    """Mean distances, pixels, between the boundaries of a map, its holes filled, and those of the truth.
 
-    Returns:
-        ``dbe_acc``: mean distance, pixels, of the map's boundaries from the truth's, of those nearer than 10;
-        ``dbe_comp``: mean of the distances both ways, at most 10 each. NaN where the truth has no boundary,
-        10 where the map has none.
-
-    Source: Koch et al., "Evaluation of CNN-based Single-Image Depth Estimation Methods" (iBims-1), S3.2.
-        Deviation: their true boundaries are drawn by hand, ours are found by the same filter.
+    ``dbe_acc``: of the map's from the truth's, of those nearer than 10; ``dbe_comp``: both ways, at most 10
+    each. NaN where the truth has none, 10 where the map has none. Source: Koch et al., "Evaluation of CNN-
+    based Single-Image Depth Estimation Methods" (iBims-1), S3.2. Deviation: their true boundaries are drawn
+    by hand, ours are found by the same filter.
     """
-    known = np.isfinite(pred_m) & (pred_m > 0)
-    true = _canny(_filled(truth_m, valid)) & valid
+    known = answered(pred_m)
+    true = _canny(filled(truth_m, valid)) & valid
     if not known.any() or not true.any():
         return {"dbe_acc": float("nan"), "dbe_comp": float("nan")}
-    drawn = _canny(_filled(pred_m, known)) & valid
+    drawn = _canny(filled(pred_m, known)) & valid
     to_true = ndimage.distance_transform_edt(~true)
     near = drawn & (to_true < FARTHEST_PX)
     if not near.any():
@@ -331,12 +264,13 @@ def boundary_errors(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) 
     return {"dbe_acc": float(to_true[near].mean()), "dbe_comp": float(np.minimum(both, FARTHEST_PX).mean())}
 
 
-def _filled(depth_m: np.ndarray, known: np.ndarray) -> np.ndarray:
+def filled(depth_m: Map, known: Map) -> Map:
+    """The map with the nearest known depth in its holes, float64."""
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     return np.asarray(depth_m, np.float64)[tuple(nearest)]
 
 
-def depth_edges(depth_m: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def depth_edges(depth_m: Map, valid: Map) -> Map:
     """``(H, W)`` bool: pixels whose 3x3 neighbourhood is known and has a step of depth in it."""
     log = np.log(np.where(valid, depth_m, 1.0))
     high = ndimage.maximum_filter(np.where(valid, log, np.inf), 3)
@@ -344,13 +278,13 @@ def depth_edges(depth_m: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.isfinite(high) & np.isfinite(low) & (high - low > LOG_STEP)
 
 
-def edge_error(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) -> float:
-    """Mean relative error within 3 px of the edges of dense truth; NaN without an edge."""
+def edge_error(pred_m: Map, truth_m: Map, valid: Map) -> float:
+    """Mean relative error within ``NEAR_EDGE`` of the edges of dense truth; NaN without an edge."""
     near = ndimage.binary_dilation(depth_edges(truth_m, valid), iterations=NEAR_EDGE) & valid
     return float((np.abs(pred_m - truth_m)[near] / truth_m[near]).mean()) if near.any() else float("nan")
 
 
-def surface_error(pred_m: np.ndarray, truth_m: np.ndarray, valid: np.ndarray) -> float:
+def surface_error(pred_m: Map, truth_m: Map, valid: Map) -> float:
     """Mean absolute error of the slope of log depth, per mille a pixel, more than 5 px from any edge."""
     off = valid & ~ndimage.binary_dilation(depth_edges(truth_m, valid), iterations=OFF_EDGE)
     difference = np.log(np.maximum(pred_m, 1e-6)) - np.log(np.where(valid, truth_m, 1.0))

@@ -1,7 +1,4 @@
-"""Options of every command of ``geodiff eval``, one dataclass each, and the table of the commands.
-
-Nothing here imports torch: the command line is built from these, and ``--help`` answers at once.
-"""
+"""Options of every command of ``geodiff eval``, and the table of the commands; nothing here imports torch."""
 
 from __future__ import annotations
 
@@ -21,7 +18,6 @@ if TYPE_CHECKING:
     from geodiff_plugin.evaluation.baselines import Settings
     from geodiff_plugin.evaluation.datasets import SampleRef
 
-CROPS = ("none", "garg", "eigen", "benchmark")
 PEERS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
 STRENGTH_METHODS = ("prior-aligned", "prior-fit", "guided", "search-only", "guided:inner_steps=5")
 FIGURES = ("gs-sweep", "inner-steps", "ablation", "exposure", "qualitative")
@@ -118,7 +114,6 @@ class PairsOptions(SampleOptions):
     sample: int | None = _count(None, "Draw this many samples at random, by --seed.")
     pairs: str = declare("default", "Of posed views: default (two) or all.", choices=("default", "all"))
     pixel_centre: float | None = declare(None, "First pixel's centre in posed cameras, 0.5 for COLMAP's.")
-    crop: str = declare("none", "Region that is scored: none, garg, eigen, benchmark (KITTI).", choices=CROPS)
     skip_broken: bool = declare(False, "Go on after a broken sample and count it.", panel=OUTPUT)
     save_depth: bool = declare(False, "Write every depth map as .npy.", panel=OUTPUT)
 
@@ -156,7 +151,6 @@ class StrengthOptions(OutOptions):
     methods: tuple[str, ...] = _list(STRENGTH_METHODS, "Methods that use a prior, see geodiff eval list.")
     steps: int | None = _count(4, "Denoising steps.", high=1000)
     resolution: int = _count(384, "Longer side for the prior, pixels.", 64, 8192)
-    figure: Path | None = declare(None, "PNG: error against the prior's error, lit surfaces.", panel=OUTPUT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,13 +171,13 @@ class RealOptions(EvalOptions):
     data: Path | None = _dir("Folder of real pairs; none by default.")
     limit: int | None = _count(None, "The first N real pairs alone.")
     rendered: int = _count(0, "Pairs of the registered set 'synthetic'.", 0, 10**6)
+    width: int = _count(512, "Width of the rendered pairs, pixels.", 64, 8192)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrustOptions(RealOptions):
     """``geodiff eval trust``."""
 
-    width: int = _count(512, "Width of the rendered pairs, pixels.", 64, 8192)
     kinds: tuple[str, ...] = _list((), "Comma-separated kinds of wrong calibration; all by default.")
     out: Path = _out("geodiff-trust")
 
@@ -192,7 +186,6 @@ class TrustOptions(RealOptions):
 class PosesOptions(RealOptions):
     """``geodiff eval poses``."""
 
-    rendered_size: str | None = declare(None, "Of rendered pairs; smaller is faster.", metavar="WIDTHxHEIGHT")
     perturb: str = declare("1.5,0.1", "Rendered: turn, shift / baseline.", metavar="DEGREES,SHARE")
     drift: str = declare("0.3,1.5", "Rectified: turn and shift of the right image.", metavar="DEGREES,PIXELS")
     resolution: int | None = _count(None, "Longer side for the prior, pixels.", 0, 8192)
@@ -225,6 +218,7 @@ class Command(NamedTuple):
 
 
 _PAPER, _CHANGES = "paper:run_paper_table", "pairs:run_changes"
+#: Every command but ``list``, by name.
 COMMANDS: dict[str, Command] = {
     "pairs": Command(DirOptions, "pairs:run_pairs", "Methods side by side on every metric pair below DIR."),
     "table1": Command(PairsOptions, _PAPER, "Table 1: KITTI, Booster and Middlebury, in metres and aligned."),
@@ -238,12 +232,9 @@ COMMANDS: dict[str, Command] = {
     "sequence": Command(SequenceOptions, "frames:run_sequence", "Frames of a moving rig; error, flicker."),
     "figure": Command(FigureOptions, "figures:run_figure", "Draw one figure as PNG, its numbers as JSON."),
     "trust": Command(TrustOptions, "calibrations:run_trust", "How many wrong calibrations are detected."),
-    "poses": Command(
-        PosesOptions, "calibrations:run_poses", "Poses as given, perturbed, refined, estimated."
-    ),
+    "poses": Command(PosesOptions, "calibrations:run_poses", "Poses given, perturbed, refined, estimated."),
     "capture": Command(CaptureEvalOptions, "frames:run_capture_eval", "Depth of a capture (extra capture)."),
 }
-"""Every command but ``list``, by name."""
 
 
 def command_line(name: str, options: Any) -> str:
@@ -292,8 +283,8 @@ def _kept(refs: Sequence[SampleRef], data: Path, scenes: Sequence[str] = ()) -> 
     return kept
 
 
-def real_and_rendered(options: RealOptions, text: str) -> tuple[list[SampleRef], list[SampleRef]]:
-    """The first pairs of ``--data``, and ``--rendered`` ones of a set such as ``synthetic:{}@512x384``."""
+def real_and_rendered(options: RealOptions, kind: str) -> tuple[list[SampleRef], list[SampleRef]]:
+    """The first pairs of ``--data``, and ``--rendered`` ones: ``synthetic`` or ``synthetic-posed``."""
     from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs
 
     if options.data is None and not options.rendered:
@@ -302,7 +293,8 @@ def real_and_rendered(options: RealOptions, text: str) -> tuple[list[SampleRef],
         cure = "A clone of the repository has it: python -m tests.scenes eval ..."
         bad_value("--rendered", "0 where no data set 'synthetic' is registered", options.rendered, cure)
     real = [] if options.data is None else _kept(find_pairs(options.data), options.data)
-    rendered = find_pairs(text.format(options.rendered), ["synthetic"]) if options.rendered else []
+    of_size = f"{kind}:{options.rendered}@{options.width}x{options.width * 3 // 4}"
+    rendered = find_pairs(of_size, ["synthetic"]) if options.rendered else []
     return real[: options.limit], rendered
 
 

@@ -26,11 +26,9 @@ from geodiff_plugin.runner import Item, Record, this_process
 
 
 def pair_cells(refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions) -> list[Item]:
-    """Cells of methods on samples, scored as the options say."""
-    names, settings, crop = tuple(dict.fromkeys(methods)), options.settings, options.crop
-    return experiment.method_cells(
-        refs, names, settings, options.out, crop=crop, save_depth=options.save_depth
-    )
+    """Cells of methods on samples, each method once."""
+    names = tuple(dict.fromkeys(methods))
+    return experiment.method_cells(refs, names, options.settings, options.out, options.save_depth)
 
 
 def compare(
@@ -55,8 +53,6 @@ def compare(
 def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
     """Sentences above the tables: the prior, what methods could not do and why, samples that were broken."""
     remarks = [f"Prior {options.prior}, seed {options.seed}, ensemble {options.ensemble}."]
-    if options.crop != "none":
-        remarks.append(f"Only what lies in the crop {options.crop!r} is scored.")
     by_status = tables.grouped(records, "status")
     impossible = tables.grouped(by_status.get("not applicable", ()), "method", "reason")
     for (method, reason), own in impossible.items():
@@ -73,14 +69,14 @@ def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
 
 def run_pairs(name: str, options: PairsOptions) -> Page | None:
     """Measure methods on pairs and write the tables; errors as ``run_experiment``."""
-    refs, count, more = select(options), this_process().count, []
+    refs, more = select(options), []
     if options.sample is not None:
         more.append(f"Drawn with seed {options.seed}: {', '.join(ref.label for ref in refs)}.")
-    if count > 1:
-        more.append(f"Run by {count} processes.")
     return compare(name, options, "Results pair by pair", refs, options.methods, tables.pairs_tables, more)
 
 
+#: What is changed, by table: ``(row, method)``, the unchanged preset first. ``guided`` and ``paper`` stand
+#: below the paper's Table 4 (no sample has known points); ``parts`` is what goes beyond the paper.
 CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
     "guided": (
         ("as it is", "guided"),
@@ -116,18 +112,13 @@ CHANGES: dict[str, tuple[tuple[str, str], ...]] = {
         ("without z-test", "guided:z_test=false"),
     ),
 }
-"""What is changed, by table: ``(row, method)``, the unchanged preset first.
-
-``guided`` and ``paper`` stand below the paper's Table 4 (no sample has known points, so their term has no
-row); ``parts`` is what the default has beyond the paper.
-"""
 _NAMES = {"guided": "The default preset", "paper": "Algorithm 1 as printed", "parts": "The default's parts"}
 
+#: The numbers that decide the default's result, by knob.
 NUMBERS = (
     *("min_steps", "corrections", "outlier_width", "match_noise", "smoothness"),
     *("weights.photometric", "weights.matches", "weights.anchor", "sweep_pixels"),
 )
-"""The numbers that decide the default's result, by knob."""
 
 
 def changes_table(records: Sequence[Record], name: str) -> Table:
@@ -154,8 +145,8 @@ def _at(number: str, factor: float) -> str:
     return f"guided:{number}={changed:g}"
 
 
+#: The default, and every one of ``NUMBERS`` at half and at twice its value.
 FLATNESS = ("guided", *(_at(number, factor) for number in NUMBERS for factor in (0.5, 2.0)))
-"""The default, and every one of ``NUMBERS`` at half and at twice its value."""
 
 
 def flatness_table(records: Sequence[Record]) -> Table:
@@ -191,14 +182,14 @@ def run_changes(name: str, options: PairsOptions) -> Page | None:
         further = tables.summary_table(added, set(map(tables.label_of, added)), title)
         if flat:
             return [flatness_table(records), further]
-        return [changes_table(records, name), further, tables.regions_table(records)]
+        return [changes_table(records, name), further, tables.details_table(records, tables.REGIONS)]
 
     title = "Flatness" if flat else "Parts of the default"
     return compare(name, options, title, refs, (*methods, *options.methods), page_tables)
 
 
+#: The stock pipeline, which everything is compared with; its alignment costs nothing beside it.
 PLAIN = "prior-aligned"
-"""The stock pipeline, which everything is compared with; its alignment costs nothing beside it."""
 COST_METHODS = (PLAIN, "search-only", "guided", "guided:gradient=full", "paper")
 #: Denoising steps when none are asked for: what the default guidance takes of a prior that takes any number.
 STEPS = 4

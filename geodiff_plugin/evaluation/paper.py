@@ -21,10 +21,7 @@ from geodiff_plugin.runner import Record
 
 
 class Column(NamedTuple):
-    """One data set of a table, of ``full_count`` pairs in the paper.
-
-    The first of ``datasets`` that is there is the ``dataset`` that is measured, on ``labels``.
-    """
+    """One data set of a table, ``full_count`` pairs in the paper; the first of ``datasets`` that is there."""
 
     title: str
     datasets: tuple[str, ...]
@@ -47,10 +44,9 @@ class Column(NamedTuple):
 
 
 class PaperRow(NamedTuple):
-    """One row of a table, predictions ``aligned`` with the truth or not; ``published`` by the column's title.
+    """One row of a table, ``published`` by the column's title.
 
-    A ``method`` such as ``hf:Intel/dpt-large`` or ``files:DIR/unidepth`` stands for every one that has the
-    first word of its last part, ``dpt``, after its colon.
+    A ``method`` such as ``files:DIR/unidepth`` stands for every one that has ``unidepth`` after its colon.
     """
 
     title: str
@@ -168,7 +164,7 @@ def layout_table(
         cells = [row.title, "✓" if row.aligned else "✗"]
         for column in columns:
             of_method = (metric.get(method, {}) for metric in values[row.aligned])
-            cells += [tables.whole_mean(own, column.labels) for own in of_method]
+            cells += [tables.whole_mean([own.get(x) for x in column.labels]) for own in of_method]
             cells += row.published.get(column.title, ["-"] * count) if column.complete else []
         rows.append(tuple(cells))
     note = "Capped at 80 m for KITTI and 10 m for Booster. † in metres as they come out."
@@ -234,6 +230,6 @@ def run_paper_table(name: str, options: PairsOptions) -> Page | None:
         for column in measured:
             title = f"All metrics, {column.title}, {count_of_pairs(len(column.labels))}"
             shown.append(tables.summary_table(records, column.labels, title))
-        return [*shown, tables.regions_table(records)]
+        return [*shown, tables.details_table(records, tables.REGIONS)]
 
     return compare(name, options, layout.title, refs, names, page_tables, more)

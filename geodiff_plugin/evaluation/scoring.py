@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.capture.agreement import DepthFrame, seen_in
 from geodiff_plugin.evaluation import metrics
-from geodiff_plugin.evaluation.baselines.base import Prediction
+from geodiff_plugin.evaluation.baselines import Prediction
 from geodiff_plugin.evaluation.baselines.unguided import sweep
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, depth_to_disparity
 from geodiff_plugin.matching import match_volume
@@ -39,9 +39,9 @@ def out_of_view(sample: StereoSample) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def matched(sample: StereoSample) -> np.ndarray | None:
-    """``(H, W)`` bool: pixels where our plane sweep of the two views has a reliable match, by the true poses.
+    """``(H, W)`` bool: where our plane sweep has a reliable match, by the true poses; ``None`` for no sweep.
 
-    Made on the CPU, so that no two runs differ. ``None`` where the views cannot be swept.
+    Made on the CPU, so that no two runs differ.
     """
     try:
         volume = sweep(replace(sample, E=sample.E_scored), "cpu")
@@ -55,8 +55,7 @@ def matched(sample: StereoSample) -> np.ndarray | None:
 def regions(sample: StereoSample) -> dict[str, np.ndarray]:
     """Masks by which AbsRel is split, ``(H, W)`` bool, within ``sample.valid``.
 
-    ``out_of_view`` always; ``matched`` and ``unmatched`` where the two views can be swept; ``visible`` and
-    ``occluded`` where the set says what is hidden; of material classes ``tom``, ``not_tom``, and each one.
+    ``matched`` where the two views can be swept; ``occluded`` where the set says what is hidden.
     """
     masks = {"out_of_view": out_of_view(sample)}
     by_match = matched(sample)
@@ -81,7 +80,7 @@ def _plain(scores: Mapping[str, float | None]) -> Scores:
 def _positive(depth_m: np.ndarray | None) -> np.ndarray:
     """The map with NaN where it is not a positive number."""
     assert depth_m is not None  # a prediction has metres where it has no relative map
-    return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.nan)
+    return np.where(metrics.answered(depth_m), depth_m, np.nan)
 
 
 def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, Scores]:
@@ -143,10 +142,8 @@ def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> 
     """Score one prediction; truth from ``cap_m`` metres on does not count under the cap.
 
     ``all_pixels``: ``raw`` and ``aligned`` errors over every pixel with truth; ``capped``: the same under the
-    cap; ``regions``: AbsRel by region under the cap, aligned for a method without metres; of metres
-    ``disparity`` of rectified pairs, ``ause`` of the uncertainty, ``confidence`` by decile,
-    ``ause_confidence`` and that of a random order, ``boundaries`` of dense truth. ``None`` where it does not
-    apply; ``ValueError`` for a map of the wrong shape or a sample without truth.
+    cap; ``regions``: AbsRel by region under the cap, aligned for a method without metres; ``None`` where
+    something does not apply. ``ValueError`` for a map of the wrong shape or a sample without truth.
     """
     truth, valid = sample.depth_m, sample.valid
     for name in ("depth_m", "relative", "uncertainty", "confidence"):

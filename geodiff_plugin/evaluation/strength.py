@@ -7,11 +7,9 @@ input says, so that an edit of one step is seen by the next one, as a trained ne
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from functools import lru_cache, partial
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,8 +27,7 @@ from geodiff_plugin.evaluation import tables
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, find_pairs, load
 from geodiff_plugin.evaluation.experiment import Page, cell_key, run_experiment
-from geodiff_plugin.evaluation.figures import draw_strength, shaded
-from geodiff_plugin.evaluation.metrics import edge_error, evaluate_depth, surface_error, to_space
+from geodiff_plugin.evaluation.metrics import edge_error, evaluate_depth, filled, surface_error, to_space
 from geodiff_plugin.evaluation.options import STRENGTHS, StrengthOptions, data_of
 from geodiff_plugin.evaluation.scoring import DENSE, in_metres
 from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, method_title, most_of
@@ -60,20 +57,15 @@ ENDS = (0.02, 0.98)
 #: Standard deviation of the smooth half of the error, and spacing of the segments of the other half, as
 #: shares of the longer side; that of the blur.
 SMOOTH, SEGMENTS, BLUR = 0.12, 0.16, 0.012
-#: The plain call whose scale and shift the truth decides, and the strength whose surfaces the figure shows.
-ORACLE, SHOWN = "prior-aligned", "5%"
-
-
 Strength = tuple[float, bool, float]  # a value of ``STRENGTHS``
 
 
 def relative_map(sample: StereoSample, strength: Strength, space: str, seed: int = 0) -> np.ndarray:
     """``(H, W)`` float64, the map of a prior that errs in a given way, the same error in every space.
 
-    0 and 1 are at the 2 % and 98 % quantiles, where it is clipped as trained maps are.
+    0 and 1 are at the quantiles ``ENDS``, where it is clipped as trained maps are.
     """
-    nearest = ndimage.distance_transform_edt(~sample.valid, return_distances=False, return_indices=True)
-    log_depth = np.log(sample.depth_m[tuple(nearest)].astype(np.float64))
+    log_depth = np.log(filled(sample.depth_m, sample.valid))
     rng = np.random.default_rng([seed, 47])
     error, blur, gamma = strength
     log_depth = log_depth + error * _error(log_depth, rng)
@@ -133,10 +125,7 @@ class _Denoiser(ModelMixin, ConfigMixin):
 
 
 class EmulatedPrior(PriorCache):
-    """The bundled pipeline with an emulated network, guided, for every method that asks for a prior.
-
-    Its maps are affine in ``space``; its later answers ``follow`` their input by so much, [0, 1].
-    """
+    """The bundled pipeline with an emulated network, affine in ``space``, whatever prior is asked for."""
 
     def __init__(self, space: str = "disparity", follow: float = 0.3) -> None:
         super().__init__()
@@ -162,45 +151,24 @@ class EmulatedPrior(PriorCache):
         self.pipe.unet.code = find_adapter(self.pipe)(self.pipe).encode(small).float()
 
 
-def _depth_m(
-    prior: EmulatedPrior, options: StrengthOptions, sample: StereoSample, strength: str, name: str
-) -> np.ndarray:
-    """``(H, W)`` metres of a method with a prior of some strength, aligned where it is relative."""
-    prior.answer(sample, STRENGTHS[strength], options.resolution, options.seed)
-    method = find_method(name)
-    try:
-        prediction = method.run(sample, method.own_settings(options.settings), prior)
-    except NotApplicable as reason:
-        got = f"{name}, not on {sample.label}: {reason}"
-        bad_value("--methods", "methods that work on every pair", got)
-    return in_metres(prediction, sample.depth_m, sample.valid)
-
-
 def _measure(
     prior: EmulatedPrior, options: StrengthOptions, read: Any, ref: SampleRef, strength: str, name: str
 ) -> Record:
-    """Errors of one method at one strength, of a pair with dense truth."""
-    sample = read(ref)
+    """Errors of one method at one strength, of a pair with dense truth, aligned where it is relative."""
+    sample, method = read(ref), find_method(name)
+    truth = (sample.depth_m, sample.valid)
     if sample.valid.mean() < DENSE:
         bad_value("--data", f"pairs with truth on {DENSE:.0%} of their pixels or more", sample.label)
-    depth_m = _depth_m(prior, options, sample, strength, name)
-    truth = (sample.depth_m, sample.valid)
+    prior.answer(sample, STRENGTHS[strength], options.resolution, options.seed)
+    try:
+        prediction = method.run(sample, method.own_settings(options.settings), prior)
+    except NotApplicable as reason:
+        bad_value("--methods", "methods that work on every pair", f"{name}, not on {sample.label}: {reason}")
+    depth_m = in_metres(prediction, *truth)
     scores = evaluate_depth(depth_m, *truth)
     kind = {"rectified": bool(sample.rectified), "rendered": sample.dataset == "synthetic"}
     errors = {"edges": edge_error(depth_m, *truth), "surfaces": surface_error(depth_m, *truth)}
     return kind | {"abs_rel": scores["abs_rel"], "delta1": scores["delta1"]} | errors
-
-
-def _pictures(prior: EmulatedPrior, options: StrengthOptions, sample: StereoSample) -> dict[str, np.ndarray]:
-    """The middle of one pair, lit, at the strength of the figure: truth, prior, fitted once, guided."""
-    strength = SHOWN if SHOWN in options.strengths else options.strengths[0]
-    height, width = sample.depth_m.shape
-    window = np.s_[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4]
-    maps = {"truth": sample.depth_m}
-    for name in (ORACLE, "prior-fit", "guided"):
-        title = f"{find_method(name).title}, {strength}"
-        maps[title] = _depth_m(prior, options, sample, strength, name)
-    return {title: shaded(depth_m[window], float(sample.K_left[0, 0])) for title, depth_m in maps.items()}
 
 
 def strength_tables(records: Sequence[Record]) -> list[Table]:
@@ -225,9 +193,6 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
     for method in map(find_method, options.methods):
         if not method.uses_prior or method.prior is not None:
             bad_value("--methods", "methods that use a prior, none named after an @", repr(method.name))
-    if options.figure is not None and ORACLE not in options.methods:
-        got = repr(",".join(options.methods))
-        bad_value("--methods", f"with {ORACLE}, the abscissa of the figure", got)
     refs = [ref for root in options.data or (data_of(options),) for ref in find_pairs(root)[: options.limit]]
     if not refs:
         bad_value("--data", "a folder with pairs", " ".join(map(str, options.data)))
@@ -241,14 +206,8 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
         key = cell_key(ref, method_name, configuration, emulated)
         cells.append(Item(key, work, name=", ".join(head.values()), head=head))
 
-    def remarks(records: list[Record]) -> list[str]:
-        said = f"Emulated priors, affine in {options.space}, following their input by {options.follow:g}; "
-        said += f"processed at {options.resolution} px, {options.steps} steps, seed {options.seed}."
-        if options.figure is None:
-            return [said]
-        draw_strength(records, ORACLE, _pictures(prior, options, load(refs[0])), options.figure)
-        page = options.results or options.out / "strength.md"
-        picture = Path(os.path.relpath(options.figure, page.parent)).as_posix()
-        return [said, f"![What guidance gains by the prior's error; surfaces, lit]({picture})"]
-
-    return run_experiment(name, options, "Priors from exact to weak", cells, strength_tables, remarks)
+    said = f"Emulated priors, affine in {options.space}, following their input by {options.follow:g}; "
+    said += f"processed at {options.resolution} px, {options.steps} steps, seed {options.seed}."
+    return run_experiment(
+        name, options, "Priors from exact to weak", cells, strength_tables, lambda _: [said]
+    )

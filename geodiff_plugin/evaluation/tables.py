@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from operator import itemgetter
 from typing import Any
 
@@ -31,6 +32,9 @@ ValueOf = Callable[[Record], float | None]
 CellOf = Callable[[list[Record]], str]
 #: Method -> label of the pair -> a number.
 Values = dict[str, dict[str, float]]
+#: Heading and records of a column; numbers of all pairs and digits -> their mean.
+Columns = Iterable[tuple[str, Sequence[Record]]]
+MeanOf = Callable[[list[float | None], int], str]
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ class Mean:
 
 
 def mean_with_interval(values: Iterable[float | None]) -> Mean:
-    """Mean of the numbers that there are, with its 95 % percentile-bootstrap interval, which is seeded."""
+    """Mean of the numbers that there are, with a seeded 95 % percentile-bootstrap interval."""
     data = np.array([value for value in values if value is not None], np.float64)
     mean = float(data.mean()) if data.size else float("nan")
     if data.size < FEWEST_FOR_INTERVAL:
@@ -196,26 +200,35 @@ def groups_of(records: Sequence[Record]) -> dict[str, set[str]]:
     return {count_of_pairs(len(own), kind): own for kind, own in groups.items()}
 
 
-def whole_mean(values: Mapping[str, float], labels: Iterable[str], digits: int = 3) -> str:
+def whole_mean(values: list[float | None], digits: int = 3) -> str:
     """The mean over pairs, a dash unless every one of them has a number."""
-    return mean_cell([values[x] for x in labels] if set(labels) <= values.keys() else [], digits)
+    return mean_cell(() if None in values else values, digits)
 
 
 def per_pair_table(
-    records: Sequence[Record], title: str, value_of: ValueOf, digits: int = 3, note: str = ""
+    title: str, columns: Columns, value_of: ValueOf, digits: int, note: str = "", mean: MeanOf = whole_mean
 ) -> Table:
-    """One row per sample, one column per method, then the means of every group."""
-    values, header = by_method(records, value_of).values(), ["pair"]
-    for own in grouped(records, "method").values():
-        raw = [record["all_pixels"]["raw"] for record in own if record["status"] == "ok"]
-        relative = raw and not any(raw) and "oracle" not in method_title(own)
-        header.append(f"{method_title(own)} + oracle" if relative else method_title(own))
-    labels = dict.fromkeys(map(label_of, records))
+    """One row per sample, one column of records each, then the means of every group."""
+    header, records_of = zip(*columns, strict=True)
+    values = [{label_of(record): value_of(record) for record in own} for own in records_of]
+    every = list(chain(*records_of))
+    labels = dict.fromkeys(map(label_of, every))
     rows = [(label, *(cell(own.get(label), digits) for own in values)) for label in labels]
-    for group, members in groups_of(records).items():
+    for group, members in groups_of(every).items():
         if members:
-            rows.append((f"mean of {group}", *(whole_mean(own, members, digits) for own in values)))
-    return Table(title, tuple(header), tuple(rows), note)
+            means = (mean([own.get(label) for label in members], digits) for own in values)
+            rows.append((f"mean of {group}", *means))
+    return Table(title, ("pair", *header), tuple(rows), note)
+
+
+def method_columns(records: Sequence[Record]) -> list[tuple[str, list[Record]]]:
+    """Heading and records of each method; without metres it needs an oracle, which the heading says."""
+    columns = []
+    for own in grouped(records, "method").values():
+        title, raw = method_title(own), [r["all_pixels"]["raw"] for r in own if r["status"] == "ok"]
+        relative = raw and not any(raw) and "oracle" not in title
+        columns.append((f"{title} + oracle" if relative else title, own))
+    return columns
 
 
 def summary_table(records: Sequence[Record], members: Collection[str], title: str) -> Table:
@@ -260,8 +273,20 @@ _BY_REGION = {
     for name, heading in _DISPARITY.items()
     if name != "bad3"
 }
+REGIONS = "AbsRel by region and material"
 #: Title -> where in a record its numbers are, their headings, note.
-_DETAILS: dict[str, tuple[str, dict[str, str], str]] = {
+DETAILS: dict[str, tuple[str, dict[str, str], str]] = {
+    REGIONS: (
+        "regions.",
+        {
+            **{"visible": "visible", "occluded": "occluded", "out_of_view": "out of view"},
+            **{"matched": "matched", "unmatched": "unmatched", "tom": "ToM", "not_tom": "other material"},
+        },
+        "Under the cap; aligned for methods that know relative depth only. Visible and occluded are known "
+        "where the data set has a mask, out of view always; matched is where our sweep of both views has a "
+        "match of confidence 0.5 or more, the same pixels for every method; ToM is transparent or mirror "
+        "(classes 2, 3).",
+    ),
     "Disparity, rectified pairs": (
         "disparity.",
         _DISPARITY,
@@ -286,37 +311,21 @@ _DETAILS: dict[str, tuple[str, dict[str, str], str]] = {
         "ensemble of at least 2 has an uncertainty.",
     ),
 }
-_REGIONS = {"visible": "visible", "occluded": "occluded", "out_of_view": "out of view", "matched": "matched"}
-_REGIONS |= {"unmatched": "unmatched", "tom": "ToM", "not_tom": "other material"}
 
 
-def _details(records: Sequence[Record], title: str, where: str, headings: dict[str, str], note: str) -> Table:
+def details_table(records: Sequence[Record], title: str) -> Table:
     """A row per method with a value: the mean of each quantity over the pairs that have it."""
+    where, headings, note = DETAILS[title]
     done = [record for record in records if record["status"] == "ok"]
+    if title == REGIONS:
+        classes = sorted({name for r in done for name in r["regions"] if name.startswith("material_")})
+        headings = headings | {name: name.replace("material_", "class ") for name in classes}
     columns: dict[str, CellOf] = {"method": method_title}
     for name, heading in headings.items():
         count = len({label_of(record) for record in done if value_at(record, where + name) is not None})
         columns[f"{heading} ({count_of_pairs(count)})" if count else heading] = mean_of(where + name)
     table = table_of_groups(title, done, ("method",), columns, note)
     return replace(table, rows=tuple(row for row in table.rows if set(row[1:]) != {"-"}))
-
-
-def regions_table(records: Sequence[Record]) -> Table:
-    """AbsRel by what the right camera sees, by matches and material, and for each class that occurs."""
-    classes = sorted({name for r in records for name in r.get("regions") or {} if name.startswith("mat")})
-    headings = _REGIONS | {name: name.replace("material_", "class ") for name in classes}
-    note = (
-        "Under the cap; aligned for methods that know relative depth only. Visible and occluded are known "
-        "where the data set has a mask, out of view always; matched is where our sweep of both views has a "
-        "match of confidence 0.5 or more, the same pixels for every method; ToM is transparent or mirror "
-        "(classes 2, 3)."
-    )
-    return _details(records, "AbsRel by region and material", "regions.", headings, note)
-
-
-def details_tables(records: Sequence[Record]) -> list[Table]:
-    """Regions, disparity, boundaries and AUSE, as far as there are numbers."""
-    return [regions_table(records), *(_details(records, title, *rest) for title, rest in _DETAILS.items())]
 
 
 def confidence_table(records: Sequence[Record]) -> Table:
@@ -341,11 +350,12 @@ def pairs_tables(records: Sequence[Record], reference: str = "guided") -> list[T
         "All pixels with truth, no cap; metres as they come out, not aligned, except in the columns of "
         "methods that know relative depth only ('oracle'), which get scale and shift from the truth."
     )
+    columns = method_columns(records)
     return [
-        per_pair_table(records, f"AbsRel of {pairs_of(records)}", headline, note=note),
-        per_pair_table(records, "Seconds", itemgetter("seconds"), 1),
+        per_pair_table(f"AbsRel of {pairs_of(records)}", columns, headline, 3, note),
+        per_pair_table("Seconds", columns, lambda record: record.get("seconds"), 1),
         *([versus_table(records, reference)] if any(r["method"] == reference for r in records) else []),
         *(summary_table(records, own, f"All metrics, {group}") for group, own in groups_of(records).items()),
-        *details_tables(records),
+        *(details_table(records, title) for title in DETAILS),
         confidence_table(records),
     ]

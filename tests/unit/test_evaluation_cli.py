@@ -67,11 +67,10 @@ def test_pairs_goes_on_after_a_broken_sample_on_request_and_tries_it_again(data,
         ("pairs DATA --methods magic", "methods"),
         ("pairs DATA --limit 0", "--limit must be between 1"),
         ("pairs DATA --sample 3", "--sample must be at most 2"),
-        ("pairs DATA --crop middle", "--crop must be one of"),
         ("pairs DATA --scenes three", "a sample with three in its name"),
         ("pairs TWICE --methods sgbm", "with several middlebury2014/one"),
         ("poses", "--data must be given, or --rendered above 0"),
-        ("poses --rendered 1 --rendered-size 256", "--rendered-size"),
+        ("poses --rendered 1 --width 16", "--width must be between 64"),
         *((f"poses --rendered 1 --perturb {text}", "--perturb") for text in ("1.5", "1..2,0.1", "99,0")),
         *((f"poses --rendered 1 --drift {text}", "--drift") for text in ("0.3", "a,b", "9,1", "0.3,99")),
     ],
@@ -120,7 +119,7 @@ def test_the_page_of_poses(tmp_path, monkeypatch):
     """Two rendered pairs: estimated, one has no pose and the other is off by half without a word."""
     sizes = set()
 
-    def measure(ref, read, method, settings, priors, crop, path):
+    def measure(ref, read, method, settings, priors, path):
         pose = method.name.partition("=")[2]
         sizes.add(ref.files["size"])
         errors = {"given": 0.1, "refine": 0.06, "estimated": None if ref.files["seed"] > 1 else 0.5}
@@ -142,6 +141,6 @@ def test_the_page_of_poses(tmp_path, monkeypatch):
         "| off by more than 0.25, no warning | 0 | 0 | 0 | 1 |",
     ):
         assert line in page.read_text().splitlines()
-    run_poses("poses", replace(options, rendered_size="256x192", steps=2, out=tmp_path / "small"))
-    assert "geodiff eval poses --steps 2 --rendered 2 --rendered-size 256x192\n" in page.read_text()
+    run_poses("poses", replace(options, width=256, steps=2, out=tmp_path / "small"))
+    assert "geodiff eval poses --steps 2 --rendered 2 --width 256\n" in page.read_text()
     assert sizes == {(384, 512), (192, 256)}

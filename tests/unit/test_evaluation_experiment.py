@@ -20,7 +20,8 @@ from geodiff_plugin.evaluation.datasets.sample import with_perturbed_poses
 from geodiff_plugin.evaluation.experiment import RECORDS_NAME, cell_key
 from geodiff_plugin.evaluation.scoring import matched, out_of_view, regions, score
 from geodiff_plugin.evaluation.tables import (
-    details_tables,
+    DETAILS,
+    details_table,
     headline,
     mean_with_interval,
     paired_difference,
@@ -105,7 +106,7 @@ def test_regions_split_what_the_right_camera_sees_and_tables_show_them():
         head = {"dataset": each.dataset, "sample": each.name, "method": "guided", "status": "ok"}
         prediction = Prediction(factor * each.depth_m, uncertainty=np.ones(SHAPE))
         records.append(head | score(each, prediction, None))
-    by_region, *_, areas = details_tables(records)
+    by_region, *_, areas = (details_table(records, title) for title in DETAILS)
     one, two = "(1 pair)", "(2 pairs)"
     header = ["method", f"visible {one}", f"occluded {one}", f"out of view {two}", "matched", "unmatched"]
     header += [f"{name} {one}" for name in ("ToM", "other material", "class 0", "class 3")]
@@ -113,7 +114,7 @@ def test_regions_split_what_the_right_camera_sees_and_tables_show_them():
     assert by_region.rows == (("guided", "1.000", "1.000", "1.500", "-", "-", *["1.000"] * 4),)
     assert areas.rows == (("guided", "0.000", "-", "-"),)
     bare = [records[1] | {"disparity": None, "ause": None, "regions": {}, "boundaries": None}]
-    assert all(table.rows == () for table in details_tables(bare))
+    assert all(details_table(bare, title).rows == () for title in DETAILS)
 
 
 def test_regions_split_by_whether_the_views_match_which_is_found_once_a_sample(monkeypatch):
@@ -122,7 +123,7 @@ def test_regions_split_by_whether_the_views_match_which_is_found_once_a_sample(m
     monkeypatch.setattr(scoring, "sweep", lambda sample, device: swept.append(1) or sweep(sample, device))
     sample = textured_sample(valid=valid)
     for factor in (1, 2):
-        score(experiment.cropped(sample, "none"), Prediction(factor * sample.depth_m), None)
+        score(sample, Prediction(factor * sample.depth_m), None)
     masks = regions(sample)
     assert len(swept) == 1
     np.testing.assert_array_equal(masks["matched"] ^ masks["unmatched"], valid)

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings, find_method
-from geodiff_plugin.evaluation.baselines.unguided import map_name, sgbm_shift
+from geodiff_plugin.evaluation.baselines.unguided import sgbm_shift
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample, make_sample
 from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.formats import write_depth_mm, write_pfm
@@ -145,7 +145,7 @@ def test_metric_maps_are_read_and_holes_stay(tmp_path, kind, suffix, save, hole,
 
 
 def test_relative_maps_are_aligned_only_and_another_size_is_resized_in_value_too(tmp_path):
-    sample, path = slope(), tmp_path / f"{map_name('folder', 'mine')}.npy"
+    sample, path = slope(), tmp_path / "folder_mine.npy"
     np.save(path, 7 - 3 / sample.depth_m)  # no map of inverse depth falls with it
     record = score(sample, run(f"files:relative-disparity:{tmp_path}", sample), None)["all_pixels"]
     assert record["raw"] is None and record["aligned"]["abs_rel"] == pytest.approx(0, abs=1e-6)

@@ -1,4 +1,4 @@
-"""Metrics against plain loops over pixels, alignment against known affine maps, crops against their rows."""
+"""Metrics against plain loops over pixels, and alignment against known affine maps."""
 
 import math
 
@@ -16,7 +16,6 @@ from geodiff_plugin.evaluation.metrics import (
     boundary_f1,
     confidence_deciles,
     counted,
-    crop_mask,
     edge_error,
     evaluate_depth,
     evaluate_disparity,
@@ -133,39 +132,12 @@ def test_alignment_clips_what_lies_behind_the_camera_or_too_far_and_keeps_holes(
         assert np.isnan(align(np.full((1, 3), hole), truth, truth > 0, space)).all()
 
 
-#: Crop, (H, W) -> first and last row, first and last column, worked out by hand.
-RANGES = {
-    ("none", (375, 1242)): (0, 374, 0, 1241),
-    ("garg", (375, 1242)): (153, 370, 44, 1196),
-    ("eigen", (375, 1242)): (124, 341, 44, 1196),
-    ("benchmark", (375, 1242)): (23, 374, 13, 1228),
-    ("garg", (370, 1225)): (151, 365, 44, 1179),
-    ("eigen", (370, 1225)): (122, 336, 44, 1179),
-    ("benchmark", (370, 1225)): (18, 369, 4, 1219),  # an odd margin: the smaller half is on the left
-}
-
-
-@pytest.mark.parametrize(("name", "size"), RANGES)
-def test_crop_keeps_the_rows_and_columns_of_its_definition(name, size):
-    rows, columns = np.nonzero(crop_mask(name, size))
-    assert (rows.min(), rows.max(), columns.min(), columns.max()) == RANGES[name, size]
-    assert len(rows) == (np.ptp(rows) + 1) * (np.ptp(columns) + 1)
-
-
-ONE = np.ones((1, 1))
-
-
-@pytest.mark.parametrize(
-    ("call", "said"),
-    [
-        (lambda: counted(np.array([[100.0, 0.0]]), np.ones((1, 2), bool), 80.0), "no valid pixel"),
-        (lambda: ause(NAN * ONE, ONE, ONE > 0, ONE), "uncertainty must be finite"),
-        (lambda: crop_mask("benchmark", (480, 640)), "images of at least 1216 x 352; got 640 x 480"),
-    ],
-)
-def test_refusals(call, said):
-    with pytest.raises(ValueError, match=said):
-        call()
+def test_no_truth_and_no_uncertainty_are_refused():
+    one = np.ones((1, 1))
+    with pytest.raises(ValueError, match="no valid pixel"):
+        counted(np.array([[100.0, 0.0]]), np.ones((1, 2), bool), 80.0)
+    with pytest.raises(ValueError, match="uncertainty must be finite"):
+        ause(NAN * one, one, one > 0, one)
 
 
 def steps(seed, size=(17, 23)):

@@ -9,29 +9,30 @@ from typing import Any
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.config import DEFAULT, PAPER
-from geodiff_plugin.evaluation.baselines.base import Method, NotApplicable, Prediction, PriorCache, Settings
-from geodiff_plugin.evaluation.baselines.guided import GUIDED_METHODS, variant
-from geodiff_plugin.evaluation.baselines.unguided import (
-    STEREO_METHODS,
-    files_method,
-    hf_method,
-    prior_map_method,
+from geodiff_plugin.evaluation.baselines.guided import (
+    GUIDED_METHODS,
+    Method,
+    NotApplicable,
+    Prediction,
+    PriorCache,
+    Settings,
+    variant,
 )
+from geodiff_plugin.evaluation.baselines.unguided import STEREO_METHODS, files_method, hf_method
 
 __all__ = ["FAMILIES", "METHODS", "Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]
 __all__ += ["find_method"]
 
+#: Every method by name, in the order of the tables' columns.
 METHODS: dict[str, Method] = {method.name: method for method in (*GUIDED_METHODS, *STEREO_METHODS)}
-"""Every method by name, in the order of the tables' columns."""
-
+#: Methods with a parameter: ``name:parameter`` is what the function of ``name`` makes of the parameter.
 FAMILIES: dict[str, Callable[[str], Method]] = {
     "guided": partial(variant, "guided", DEFAULT),
     "paper": partial(variant, "paper", PAPER),
     "hf": hf_method,
     "files": files_method,
-    "prior-map": prior_map_method,
+    "prior-map": partial(files_method, guided=True),
 }
-"""Methods with a parameter: ``name:parameter`` is what the function of ``name`` makes of the parameter."""
 
 
 def find_method(name: str) -> Method:

@@ -14,15 +14,16 @@ import torch
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.baselines.base import (
+from geodiff_plugin.evaluation.baselines.guided import (
     Method,
     NotApplicable,
     Prediction,
     PriorCache,
     Settings,
     folder_fingerprint,
+    guided_configuration,
+    guided_map,
 )
-from geodiff_plugin.evaluation.baselines.guided import guided_configuration, guided_map
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, disparity_to_depth, read_depth_m
 from geodiff_plugin.formats import as_image_01, read_depth_png
 from geodiff_plugin.formats.depth import read_map
@@ -136,18 +137,13 @@ def hf_method(name: str) -> Method:
     return Method(f"hf:{name}", title, f"{title} by transformers", run, configuration, uses_prior=False)
 
 
+#: What the maps of a folder are; ``depth`` unless the method says otherwise.
 KINDS = {
     "depth": "metres",
     "disparity": "pixels of the left view, rectified pairs",
     "relative-depth": "depth up to scale and shift",
     "relative-disparity": "inverse depth up to scale and shift",
 }
-"""What the maps of a folder are; ``depth`` unless the method says otherwise."""
-
-
-def map_name(dataset: str, sample: str) -> str:
-    """Name of a sample's map without its suffix, the one that ``--save-depth`` writes."""
-    return f"{dataset}_{sample}"
 
 
 def _read(path: Path, kind: str) -> np.ndarray:
@@ -180,11 +176,10 @@ def _prediction(values: np.ndarray, sample: StereoSample, kind: str) -> Predicti
 
 
 def files_method(text: str, guided: bool = False) -> Method:
-    """Maps that were made elsewhere, in a folder: files:DIR or files:KIND:DIR.
+    """Maps that were made elsewhere, in a folder: DIR or KIND:DIR.
 
-    The map of a sample is ``DIR/<dataset>_<sample>`` with the suffix .npy, .pfm or .png (16 bit: millimetres
-    for depth, pixels * 256 for disparity), of any size; 0 and what is not finite is unknown. ``guided``: the
-    maps are the prior of the default preset.
+    The map of a sample is ``DIR/<dataset>_<sample>`` with the suffix .npy, .pfm or .png (16 bit), of any
+    size. ``guided``: the maps are the prior of the default preset.
     """
     kind, colon, named = text.partition(":")
     if not (colon and kind in KINDS):
@@ -195,8 +190,7 @@ def files_method(text: str, guided: bool = False) -> Method:
         bad_value("methods", "files:DIR or files:KIND:DIR with an existing folder", repr(text), cure)
 
     def run(sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
-        stem = map_name(sample.dataset, sample.name)
-        paths = [folder / f"{stem}{suffix}" for suffix in (".npy", ".pfm", ".png")]
+        paths = [folder / f"{sample.dataset}_{sample.name}{suffix}" for suffix in (".npy", ".pfm", ".png")]
         path = next((path for path in paths if path.is_file()), None)
         if path is None:
             raise NotApplicable("no map in the folder")
@@ -213,8 +207,3 @@ def files_method(text: str, guided: bool = False) -> Method:
     if guided:
         return Method(f"prior-map:{text}", f"guided {name}", f"{title}, guided", run, configuration, False)
     return Method(f"files:{text}", name, title, run, configuration, uses_prior=False)
-
-
-def prior_map_method(text: str) -> Method:
-    """Such maps as the prior of the default preset: prior-map:DIR or prior-map:KIND:DIR."""
-    return files_method(text, guided=True)

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.datasets.layouts import LAYOUTS
 from geodiff_plugin.evaluation.datasets.sample import CHANGES, Dataset, SampleRef, StereoSample
 
-__all__ = ["DATASETS", "Dataset", "SampleRef", "StereoSample", "find_pairs", "load", "load_pairs"]
+__all__ = ["DATASETS", "Dataset", "SampleRef", "StereoSample", "find_pairs", "load"]
 
+#: Every data set by name, in the order in which results are listed.
 DATASETS: dict[str, Dataset] = {dataset.name: dataset for dataset in LAYOUTS}
-"""Every data set by name, in the order in which results are listed."""
 
 
 def load(ref: SampleRef) -> StereoSample:
-    """Read the sample that ``ref`` points to with its data set's loader, and change it as ``ref`` asks."""
+    """Read the sample that ``ref`` points to, and change it as ``ref`` asks."""
     sample = DATASETS[ref.dataset].load(ref)
     for key, (_, changed) in CHANGES.items():
         if key in ref.files:
@@ -42,8 +42,3 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **option
     if not refs and not os.path.isdir(root):
         bad_value("root", "an existing folder", str(root))
     return refs
-
-
-def load_pairs(root: str | Path, datasets: Iterable[str] | None = None) -> Iterator[StereoSample]:
-    """Read every metric pair below ``root``, one at a time; arguments and errors as ``find_pairs``."""
-    return map(load, find_pairs(root, datasets))

@@ -5,6 +5,7 @@ Depth of a rectified pair is ``f b / (d + doffs)`` in metres, with doffs in pixe
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -22,9 +23,7 @@ from geodiff_plugin.evaluation.datasets.sample import (
     Images,
     SampleRef,
     StereoSample,
-    check_size,
     disparity_to_depth,
-    folders,
     make_sample,
     read_depth_m,
     read_rgb,
@@ -46,8 +45,25 @@ def _read_pair(ref: SampleRef) -> tuple[Images, Rig]:
     sizes = (first, rig.size_left, "left"), (second or first, rig.size_right, "right")
     for image, (path, size, side) in zip(images, sizes, strict=True):
         if size is not None:
-            check_size(path, size[::-1], image.shape, side)
+            _check_size(path, size[::-1], image.shape, side)
     return images, rig
+
+
+def _folders(root: Path, depth: int) -> list[Path]:
+    """``root`` and the folders below it down to ``depth`` levels, sorted."""
+    levels = [[root] if os.path.isdir(root) else []]
+    for _ in range(depth):
+        below = chain.from_iterable(sorted(parent.iterdir()) for parent in levels[-1])
+        levels.append([path for path in below if path.is_dir()])
+    return list(chain(*levels))
+
+
+def _check_size(path: Path, got: tuple[int, ...], expected: tuple[int, ...], side: str = "left") -> None:
+    """Raise ``ValueError`` naming ``path`` where its ``(H, W)`` is not that of the image of a ``side``."""
+    if tuple(got[:2]) != tuple(expected[:2]):
+        size = f"for {expected[1]} x {expected[0]} pixels as the {side} image"
+        cure = "Image, calibration and truth must be of one resolution."
+        bad_value(str(path), size, f"{got[1]} x {got[0]}", cure)
 
 
 def _existing(path: Path) -> Path | None:
@@ -56,12 +72,10 @@ def _existing(path: Path) -> Path | None:
 
 def _like(image: np.ndarray, path: Path, values: np.ndarray) -> np.ndarray:
     """The values of a file, which must be as many as the image's pixels."""
-    check_size(path, values.shape, image.shape)
+    _check_size(path, values.shape, image.shape)
     return values
 
 
-#: Truth beyond 80 m does not count, the range that monocular depth papers use on KITTI.
-KITTI_CAP_M = 80.0
 #: Folders of left and right images with the numbers of their cameras, of calibrations, of both truths.
 _KITTI = {
     "kitti2015": ([("image_2", "image_3", (2, 3))], "calib_cam_to_cam", "disp_occ_0", "disp_noc_0"),
@@ -73,12 +87,9 @@ _KITTI = {
 
 
 def _find_kitti(root: Path, name: str) -> list[SampleRef]:
-    """Pairs below the folder ``training``, its parent or that one's; colour where there is some, else grey.
-
-    The truth of a pair is that of all pixels where it exists, else that of the pixels seen twice.
-    """
+    """Pairs below ``training``, its parent or that one's: colour before grey, all pixels before fewer."""
     refs, (pairs, calibrations, *truths) = [], _KITTI[name]
-    for folder in folders(root, 3):
+    for folder in _folders(root, 3):
         there = [pair for pair in pairs if (folder / pair[0]).is_dir()]
         if not there or not any((folder / truth).is_dir() for truth in truths):
             continue
@@ -115,14 +126,12 @@ _TESTS = ("testF", "testH", "testQ", "two_view_test")
 
 
 def _find_scenes(root: Path, name: str) -> list[SampleRef]:
-    """Scenes of one of the three sets in Middlebury's format: folders with ``im0.png`` and ``calib.txt``.
+    """Folders of one of the three sets in Middlebury's format, but test scenes without truth.
 
-    The truth is ``disp0.pfm`` (2014), ``disp0GT.pfm`` beside the images (MiddEval3), or ``disp0GT.pfm`` in
-    ``two_view_training_gt/<scene>`` (ETH3D). The set follows from the folder's name (``eth3d``,
-    ``two_view``), else from the truth's. Test scenes without truth are none.
+    The set follows from the folder's name (``eth3d``, ``two_view``), else from the truth's.
     """
     refs = []
-    for folder in folders(root, 3):
+    for folder in _folders(root, 3):
         if not ((folder / "im0.png").is_file() and (folder / "calib.txt").is_file()):
             continue
         beside = folder.parent.parent / "two_view_training_gt" / folder.name / "disp0GT.pfm"
@@ -148,10 +157,7 @@ def _step_px(disparity: np.ndarray) -> float:
 
 
 def _load_scene(ref: SampleRef) -> StereoSample:
-    """Read one pair in Middlebury's format; its mask has 255 seen twice, 128 hidden on the right, 0 unknown.
-
-    ``notes["disparity_step_px"]`` says how coarse the truth is (Adirondack's quarter size: 1 px).
-    """
+    """Read one pair in Middlebury's format; its mask is 128 for hidden on the right, 0 for unknown."""
     (images, rig), truth, mask = _read_pair(ref), ref.files["disparity"], ref.files["mask"]
     disparity = _like(images[0], truth, read_map(truth, "true disparity"))
     valid, occluded = np.isfinite(disparity), None
@@ -163,24 +169,24 @@ def _load_scene(ref: SampleRef) -> StereoSample:
     return make_sample(ref, images, rig, depth_m, notes, occluded=occluded)
 
 
+#: Booster's images of 12 megapixels are scored at a quarter of their size, as the set's authors do.
 SHRINK = 4
-"""Booster's images of 12 megapixels are scored at a quarter of their size, as the set's authors do."""
 #: Every fourth value: truth and classes must not be mixed across edges.
 _EVERY = np.s_[SHRINK // 2 :: SHRINK, SHRINK // 2 :: SHRINK]
 
 
-def _find_booster(root: Path) -> list[SampleRef]:
+def _find_booster(root: Path, name: str) -> list[SampleRef]:
     """Every image pair of every scene of the balanced split, which has one truth and several lightings."""
     refs = []
-    for scene in folders(root, 3):
+    for scene in _folders(root, 3):
         if not ((scene / "camera_00").is_dir() and (scene / "camera_02").is_dir()):
             continue
         names = {"disparity": "disp_00.npy", "occluded": "mask_00.png", "material": "mask_cat.png"}
         names["calibration"] = "calib_00-02.xml"
         for left in sorted((scene / "camera_00").glob("im*.png")):
             files = {"left": left, "right": scene / "camera_02" / left.name}
-            files |= {key: scene / name for key, name in names.items()}
-            refs.append(SampleRef("booster", f"{scene.name}-{left.stem}", files))
+            files |= {key: scene / file for key, file in names.items()}
+            refs.append(SampleRef(name, f"{scene.name}-{left.stem}", files))
     return refs
 
 
@@ -195,8 +201,8 @@ def _quartered(image: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _load_booster(ref: SampleRef) -> StereoSample:
     """Read one pair at a quarter of its size; the disparity is in pixels of the full size, 0 = unknown.
 
-    Masks, where the scene has them: ``occluded`` (0 = hidden in the right view), and ``material`` (class 0
-    the least, 3 the most specular or transparent; 2 and 3 are the authors' ToM, transparent or mirror).
+    Masks, where the scene has them: ``occluded``, 0 where hidden, and ``material``: class 0 the least, 3 the
+    most specular or transparent.
     """
     files = ref.files
     (left, right), rig = _read_pair(ref)
@@ -219,24 +225,13 @@ def _load_booster(ref: SampleRef) -> StereoSample:
 
 #: Further views of the reference that a posed sample brings along, the best ones first.
 MOST_OTHERS = 4
+#: The views with filtered truth that the Robust Multi-View Depth Benchmark scores: 18, 25, 13 and 13.
 KEY_VIEWS: dict[str, tuple[int, ...]] = {
     "Barn": tuple(range(60, 401, 20)),
     "Church": tuple(range(10, 491, 20)),
     "Courthouse": (243, 263, 283, 343, 523, 743, 763, 783, 923, 943, 963, 983, 1103),
     "Ignatius": tuple(range(17, 258, 20)),
 }
-"""The views with filtered truth that the Robust Multi-View Depth Benchmark scores: 18, 25, 13 and 13."""
-
-
-def _groups(root: Path, pairs: str, benchmark: bool) -> list[tuple[Path, dict[int, list[int]]]]:
-    """Folders with ``images``, ``cams`` and ``pair.txt``, down to two levels; the sources of their views."""
-    check_choice(pairs, "pairs", ("default", "all"))
-    return [
-        (group, _sources_of(group / "pair.txt"))
-        for group in folders(root, 2)
-        if (group / "pair.txt").is_file() and (group / "cams").is_dir() and (group / "images").is_dir()
-        if benchmark == (group.name in KEY_VIEWS and (group / "depth").is_dir())
-    ]
 
 
 def _sources_of(path: Path) -> dict[int, list[int]]:
@@ -253,18 +248,44 @@ def _sources_of(path: Path) -> dict[int, list[int]]:
     return sources
 
 
-def _posed_files(group: Path, views: list[int], pixel_centre: float, truth: Path) -> dict[str, Any]:
-    """``files`` of a posed reference: of the left view, the right one, and the first four of the others."""
-    others = dict.fromkeys(view for view in views[2:] if view not in views[:2])
-    taken = [*views[:2], *list(others)[:MOST_OTHERS]]
-    files: dict[str, Any] = {"views": tuple(taken), "pixel_centre": pixel_centre, "truth": truth}
-    names = [("left", "calibration"), ("right", "calibration_right")]
-    names += [(f"image {view}", f"camera {view}") for view in taken[2:]]
-    for view, (image, camera) in zip(taken, names, strict=True):
-        images = [group / "images" / f"{view:08d}{suffix}" for suffix in (".png", ".jpg", ".jpeg")]
-        files[image] = next((path for path in images if path.is_file()), images[0])
-        files[camera] = group / "cams" / f"{view:08d}_cam.txt"
-    return files
+def _posed_views(group: Path, every: bool, benchmark: bool) -> list[list[int]]:
+    """For each sample of a group its left view, the right one, and all that may come along, best first."""
+    sources = _sources_of(group / "pair.txt")
+    if not (every or benchmark):
+        views = sorted({*sources, *chain(*sources.values())})
+        return [views] if len(views) > 1 else []
+    listed = {view: sources.get(view, []) for view in KEY_VIEWS[group.name]} if benchmark else sources
+    return [[i, j, *listed[i]] for i in listed for j in (listed[i] if every else listed[i][:1])]
+
+
+def _find_posed(root: Path, name: str, pairs: str = "default", pixel_centre: float = 0.0) -> list[SampleRef]:
+    """Groups with ``images``, ``cams`` and ``pair.txt``, down to two levels.
+
+    Of ``robustmvd`` every key view with its best source, of others the first two views of each group; with
+    ``pairs="all"`` every listed pair. ``pixel_centre`` is the coordinate of the top-left pixel's centre in
+    the cameras' convention. The truth of ``mvsnet`` is our addition to the layout.
+    """
+    check_choice(pairs, "pairs", ("default", "all"))
+    refs, every, benchmark = [], pairs == "all", name == "robustmvd"
+    for group in _folders(root, 2):
+        there = (group / "pair.txt").is_file() and (group / "cams").is_dir() and (group / "images").is_dir()
+        if not there or benchmark != (group.name in KEY_VIEWS and (group / "depth").is_dir()):
+            continue
+        for left, right, *others in _posed_views(group, every, benchmark):
+            label = f"{group.name}-{left}-{right}" if every or benchmark else group.name
+            others = list(dict.fromkeys(view for view in others if view not in (left, right)))
+            taken = (left, right, *others[:MOST_OTHERS])
+            # The benchmark's truth is counted from 1, as its scans are.
+            truth = f"depth/{left + 1:06d}.npz" if benchmark else f"depths/{left:08d}.pfm"
+            files: dict[str, Any] = {"views": taken, "pixel_centre": pixel_centre, "truth": group / truth}
+            names = [("left", "calibration"), ("right", "calibration_right")]
+            names += [(f"image {view}", f"camera {view}") for view in taken[2:]]
+            for view, (image, camera) in zip(taken, names, strict=True):
+                images = [group / "images" / f"{view:08d}{suffix}" for suffix in (".png", ".jpg", ".jpeg")]
+                files[image] = next(filter(_existing, images), images[0])
+                files[camera] = group / "cams" / f"{view:08d}_cam.txt"
+            refs.append(SampleRef(name, label, files))
+    return refs
 
 
 def _load_posed(ref: SampleRef) -> StereoSample:
@@ -288,37 +309,6 @@ def _load_posed(ref: SampleRef) -> StereoSample:
     return make_sample(ref, images, shifted, depth_m, notes, extra_views=tuple(extra))
 
 
-def find_robustmvd(root: Path, pairs: str = "default", pixel_centre: float = 0.5) -> list[SampleRef]:
-    """Every key view with its best source view or, for ``pairs="all"``, all its sources; COLMAP's cameras."""
-    refs = []
-    for scene, sources in _groups(root, pairs, benchmark=True):
-        for view in KEY_VIEWS[scene.name]:
-            listed = sources.get(view, [])
-            truth = scene / "depth" / f"{view + 1:06d}.npz"  # counted from 1, as the scans are
-            for source in listed if pairs == "all" else listed[:1]:
-                files = _posed_files(scene, [view, source, *listed], pixel_centre, truth)
-                refs.append(SampleRef("robustmvd", f"{scene.name}-{view}-{source}", files))
-    return refs
-
-
-def find_mvsnet(root: Path, pairs: str = "default", pixel_centre: float = 0.0) -> list[SampleRef]:
-    """The first two views of each group or, for ``pairs="all"``, every ordered pair of ``pair.txt``.
-
-    The truth, our addition to the layout, is ``depths/<view>.pfm`` in metres. ``pixel_centre`` is the
-    coordinate of the top-left pixel's centre in the cameras' convention.
-    """
-    refs = []
-    for group, sources in _groups(root, pairs, benchmark=False):
-        chosen = [sorted({*sources, *chain(*sources.values())})]
-        if pairs == "all":
-            chosen = [[i, j, *sources[i]] for i in sources for j in sources[i]]
-        for views in (views for views in chosen if len(views) > 1):
-            name = group.name if pairs == "default" else f"{group.name}-{views[0]}-{views[1]}"
-            truth = group / "depths" / f"{views[0]:08d}.pfm"
-            refs.append(SampleRef("mvsnet", name, _posed_files(group, views, pixel_centre, truth)))
-    return refs
-
-
 _DEPTHS = ("depth.npy", "depth.pfm", "depth.png", "depth_mm.png")
 
 
@@ -329,29 +319,28 @@ def _image(folder: Path, stem: str) -> Path | None:
     return min(listed, key=lambda path: (path.suffix.lower() != ".png", path.name), default=None)
 
 
-def _find_folders(root: Path) -> list[SampleRef]:
-    """``root`` and the folders right below it with ``left.*``, ``right.*``, ``calib.*`` and perhaps depth.
+def _find_folders(root: Path, name: str) -> list[SampleRef]:
+    """``root`` and the folders right below it with at least two of ``left.*``, ``right.*`` and ``calib.*``.
 
-    A folder that lacks one of the three counts as a pair: reading it names the file that is missing. The
-    calibration is one file of any known format, or ``calib_left.*`` and ``calib_right.*``.
+    Reading the pair names the third file. The calibration is one file, or ``calib_left.*`` and
+    ``calib_right.*``.
     """
     refs = []
-    for folder in folders(root, 1):
+    for folder in _folders(root, 1):
         left, right = _image(folder, "left"), _image(folder, "right")
         single = sorted(folder.glob("calib.*"))
         pair = [*sorted(folder.glob("calib_left.*"))[:1], *sorted(folder.glob("calib_right.*"))[:1]]
         calibrated = bool(single) or len(pair) == 2
         if not (left or right) or bool(left) + bool(right) + calibrated < 2:
             continue
-        # What is missing has a path as well, so that reading the pair says so.
         files = {
             "left": left or folder / "left.png",
             "right": right or folder / "right.png",
             "calibration": single[0] if single else pair[0] if calibrated else folder / "calib.txt",
             "calibration_right": pair[1] if calibrated and not single else None,
-            "depth": next(filter(None, (_existing(folder / name) for name in _DEPTHS)), None),
+            "depth": next(filter(None, (_existing(folder / depth) for depth in _DEPTHS)), None),
         }
-        refs.append(SampleRef("folder", folder.resolve().name, files))
+        refs.append(SampleRef(name, folder.resolve().name, files))
     return refs
 
 
@@ -365,53 +354,53 @@ def _load_folder(ref: SampleRef) -> StereoSample:
     return make_sample(ref, images, rig, depth_m, {"truth": truth})
 
 
-LAYOUTS = (
-    Dataset(
-        *("kitti2015", partial(_find_kitti, name="kitti2015"), _load_kitti, KITTI_CAP_M),
+_POSED = ("pairs", "pixel_centre")
+#: How each set is found, read and capped (metres), the options of finding it, and how to obtain it.
+_LAYOUTS: dict[str, tuple[Any, Any, float | None, tuple[str, ...], str]] = {
+    "kitti2015": (
+        *(_find_kitti, _load_kitti, 80.0, ()),
         "data_scene_flow.zip and data_scene_flow_calib.zip from "
-        "https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php (CC BY-NC-SA 3.0), unpacked into one "
-        "folder.",
+        "https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php (CC BY-NC-SA 3.0), in one folder.",
     ),
-    Dataset(
-        *("kitti2012", partial(_find_kitti, name="kitti2012"), _load_kitti, KITTI_CAP_M),
+    "kitti2012": (
+        *(_find_kitti, _load_kitti, 80.0, ()),
         "data_stereo_flow.zip from https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php "
-        "(CC BY-NC-SA 3.0), unpacked into one folder.",
+        "(CC BY-NC-SA 3.0).",
     ),
-    Dataset(
-        *("middlebury2014", partial(_find_scenes, name="middlebury2014"), _load_scene, None),
+    "middlebury2014": (
+        *(_find_scenes, _load_scene, None, ()),
         "scene folders from https://vision.middlebury.edu/stereo/data/scenes2014/ (free with citation).",
     ),
-    Dataset(
-        *("middeval3", partial(_find_scenes, name="middeval3"), _load_scene, None),
+    "middeval3": (
+        *(_find_scenes, _load_scene, None, ()),
         "MiddEval3-data-Q.zip and MiddEval3-GT0-Q.zip (or H, F) from "
-        "https://vision.middlebury.edu/stereo/submit3/, unpacked into one folder.",
+        "https://vision.middlebury.edu/stereo/submit3/, in one folder.",
     ),
-    Dataset(
-        *("eth3d", partial(_find_scenes, name="eth3d"), _load_scene, None),
+    "eth3d": (
+        *(_find_scenes, _load_scene, None, ()),
         "two_view_training.7z and two_view_training_gt.7z from https://www.eth3d.net/datasets "
-        "(CC BY-NC-SA 4.0), unpacked into two_view_training and two_view_training_gt.",
+        "(CC BY-NC-SA 4.0), in folders of these names.",
     ),
-    Dataset(
-        *("booster", _find_booster, _load_booster, 10.0),
-        "booster_gt.zip from https://cvlab-unibo.github.io/booster-web/ (non-commercial research), "
-        "unpacked: train/balanced/<scene>.",
+    "booster": (
+        *(_find_booster, _load_booster, 10.0, ()),
+        "booster_gt.zip from https://cvlab-unibo.github.io/booster-web/ (non-commercial research).",
     ),
-    Dataset(
-        *("mvsnet", find_mvsnet, _load_posed, None),
+    "mvsnet": (
+        *(_find_posed, _load_posed, None, _POSED),
         "folders of images/, cams/ and pair.txt as MVSNet code circulates Tanks and Temples; "
         "for the numbers here also depths/*.pfm in metres.",
-        ("pairs", "pixel_centre"),
     ),
-    Dataset(
-        *("robustmvd", find_robustmvd, _load_posed, None),
-        "tanks_and_temples_images.zip and tanks_and_temples_depth.zip, fetched by "
-        "download_tanks_and_temples.sh of https://github.com/lmb-freiburg/robustmvd; then cams/ and pair.txt "
-        "from its sample list as docs/how-to/evaluation.md shows.",
-        ("pairs", "pixel_centre"),
+    "robustmvd": (
+        *(partial(_find_posed, pixel_centre=0.5), _load_posed, None, _POSED),
+        "tanks_and_temples_images.zip and tanks_and_temples_depth.zip of https://github.com/lmb-freiburg/"
+        "robustmvd; then cams/ and pair.txt from its sample list as docs/how-to/evaluation.md shows.",
     ),
-    Dataset(
-        *("folder", _find_folders, _load_folder, None),
-        "your own: <pair>/left.png, right.png, calib.* (any known format) and depth.npy, .pfm (metres) "
-        "or .png (mm).",
+    "folder": (
+        *(_find_folders, _load_folder, None, ()),
+        "your own: <pair>/left.png, right.png, calib.* and depth.npy, .pfm (metres) or .png (mm).",
     ),
-)
+}
+LAYOUTS = [
+    Dataset(name, partial(find, name=name), load, cap_m, obtain, options)
+    for name, (find, load, cap_m, options, obtain) in _LAYOUTS.items()
+]

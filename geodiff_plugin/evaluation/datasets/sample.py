@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -24,45 +22,30 @@ from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.types import Rig
 
-ExtraView = tuple[np.ndarray, np.ndarray, np.ndarray]
-Images = tuple[np.ndarray, np.ndarray]
+Array = np.ndarray
+Images = tuple[Array, Array]
+Numbers = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class StereoSample:
-    """Two posed views with the truth of the left one.
-
-    Attributes:
-        dataset, name: its name in ``DATASETS``, and of the sample within it.
-        left, right: ``(H, W, 3)`` and ``(H', W', 3)`` uint8; the left one is the reference view.
-        K_left, K_right: ``(3, 3)`` float64, pixels.
-        E: ``(4, 4)`` float64, metres; pose of the right camera in the left camera's frame.
-        depth_m: ``(H, W)`` float32, metres; 0 where the truth is unknown.
-        valid: ``(H, W)`` bool, where the truth is known.
-        occluded: ``(H, W)`` bool, hidden in the right view or outside it; ``None`` if the set is silent.
-        material: ``(H, W)`` uint8 material class; ``None`` where the set has none.
-        rectified: whether rows are epipolar lines with equal focal lengths (``geometry.is_rectified``).
-        notes: what a reader of the numbers should know, e.g. ``truth``, ``disparity_step_px``.
-        extra_views: ``(image, K, E)`` of further views, ``E`` the pose in the left camera's frame.
-        E_true: ``(4, 4)`` the pose that the right image was taken from, where ``E`` is given wrongly on
-            purpose, but for the length of the baseline; ``None`` where ``E`` is it.
-    """
+    """Two posed views with the truth of the left one, the reference view."""
 
     dataset: str
     name: str
-    left: np.ndarray
-    right: np.ndarray
-    K_left: np.ndarray
-    K_right: np.ndarray
-    E: np.ndarray
-    depth_m: np.ndarray
-    valid: np.ndarray
-    occluded: np.ndarray | None = None
-    material: np.ndarray | None = None
-    rectified: bool = False
-    notes: Mapping[str, Any] = field(default_factory=dict)
-    extra_views: tuple[ExtraView, ...] = ()
-    E_true: np.ndarray | None = None
+    left: Array  # (H, W, 3) uint8, as the right one, which may have another size
+    right: Array
+    K_left: Array  # (3, 3) float64, pixels
+    K_right: Array
+    E: Array  # (4, 4) float64, metres: pose of the right camera in the left camera's frame
+    depth_m: Array  # (H, W) float32; 0 where the truth is unknown
+    valid: Array  # (H, W) bool, where it is known
+    occluded: Array | None = None  # (H, W) bool, hidden in the right view or outside it, if the set says
+    material: Array | None = None  # (H, W) uint8 class, if the set has any
+    rectified: bool = False  # as geometry.is_rectified
+    notes: Mapping[str, Any] = field(default_factory=dict)  # for a reader: truth, disparity_step_px ...
+    extra_views: tuple[tuple[Array, Array, Array], ...] = ()  # further (image, K, E)
+    E_true: Array | None = None  # where E is wrong on purpose, but for the length of the baseline
 
     @property
     def label(self) -> str:
@@ -70,7 +53,7 @@ class StereoSample:
         return f"{self.dataset}/{self.name}"
 
     @property
-    def E_scored(self) -> np.ndarray:
+    def E_scored(self) -> Array:
         """``(4, 4)`` the pose that truth and scores go by, whatever the methods are given."""
         return self.E if self.E_true is None else self.E_true
 
@@ -84,10 +67,7 @@ class StereoSample:
 
 @dataclass(frozen=True, eq=False)
 class SampleRef:
-    """A sample that was listed but not read yet; ``files`` has the paths and numbers that its loader needs.
-
-    A result is kept by what is in these files: name them, not their folder.
-    """
+    """A sample that was not read yet; a result is kept by what is in the files that ``files`` names."""
 
     dataset: str
     name: str
@@ -116,13 +96,10 @@ class Dataset:
     needs_folder: bool = True
 
 
-def disparity_to_depth(
-    disparity_px: np.ndarray, K_left: np.ndarray, K_right: np.ndarray, E: np.ndarray
-) -> np.ndarray:
+def disparity_to_depth(disparity_px: Array, K_left: Array, K_right: Array, E: Array) -> Array:
     """``(H, W)`` float32 metres of a rectified pair's disparity: ``f b / (d + cx_right - cx_left)``.
 
-    The disparity is ``x_left - x_right`` in pixels, the difference of the centres Middlebury's ``doffs``; the
-    result is 0 where their sum is not positive or not finite.
+    The difference of the centres is Middlebury's ``doffs``; 0 where the sum is not positive or not finite.
     """
     if E[0, 3] <= 0:
         bad_value("E[0, 3]", "positive, the right camera to the right", E[0, 3], "Swap the two views.")
@@ -131,24 +108,19 @@ def disparity_to_depth(
     return np.where(known, K_left[0, 0] * E[0, 3] / np.where(known, shifted, 1.0), 0).astype(np.float32)
 
 
-def depth_to_disparity(
-    depth_m: np.ndarray, K_left: np.ndarray, K_right: np.ndarray, E: np.ndarray
-) -> np.ndarray:
+def depth_to_disparity(depth_m: Array, K_left: Array, K_right: Array, E: Array) -> Array:
     """``(H, W)`` float64, pixels: the inverse of ``disparity_to_depth`` for positive depth."""
     return K_left[0, 0] * E[0, 3] / np.asarray(depth_m, np.float64) - (K_right[0, 2] - K_left[0, 2])
 
 
-def read_rgb(path: Path, name: str) -> np.ndarray:
+def read_rgb(path: Path, name: str) -> Array:
     """``(H, W, 3)`` uint8 of an image file, grey repeated; errors as ``formats.read_image``."""
     image_01, _ = read_image(path, name)
     return np.rint(image_01 * 255.0).astype(np.uint8)
 
 
-def read_depth_m(path: Path, name: str) -> np.ndarray:
-    """``(H, W)`` metres of an npy or PFM file, or of a 16-bit PNG of millimetres; 0 or not finite is unknown.
-
-    Errors are those of ``formats.depth.read_map``; ``ValueError`` for an npy file of integers, too.
-    """
+def read_depth_m(path: Path, name: str) -> Array:
+    """``(H, W)`` metres of an npy file of floats, a PFM file, or a 16-bit PNG of millimetres."""
     if path.suffix == ".png":
         return read_depth_png(path, name=name)[0]
     values = read_map(path, name)
@@ -158,25 +130,8 @@ def read_depth_m(path: Path, name: str) -> np.ndarray:
     return values
 
 
-def check_size(path: Path, got: tuple[int, ...], expected: tuple[int, ...], side: str = "left") -> None:
-    """Raise ``ValueError`` naming ``path`` where its ``(H, W)`` is not that of the image of a ``side``."""
-    if tuple(got[:2]) != tuple(expected[:2]):
-        size = f"for {expected[1]} x {expected[0]} pixels as the {side} image"
-        cure = "Image, calibration and truth must be of one resolution."
-        bad_value(str(path), size, f"{got[1]} x {got[0]}", cure)
-
-
-def folders(root: Path, depth: int) -> list[Path]:
-    """``root`` and the folders below it down to ``depth`` levels, sorted."""
-    levels = [[root] if os.path.isdir(root) else []]
-    for _ in range(depth):
-        below = chain.from_iterable(sorted(parent.iterdir()) for parent in levels[-1])
-        levels.append([path for path in below if path.is_dir()])
-    return list(chain(*levels))
-
-
 def make_sample(
-    ref: SampleRef, images: Images, rig: Rig, depth_m: np.ndarray, notes: dict[str, Any], **masks: Any
+    ref: SampleRef, images: Images, rig: Rig, depth_m: Array, notes: dict[str, Any], **masks: Any
 ) -> StereoSample:
     """The sample of a reference, once its files are read.
 
@@ -199,8 +154,6 @@ def make_sample(
 #: Errors are drawn between this share of the asked ones and all of them.
 LEAST = 0.3
 
-Numbers = tuple[float, float]
-
 
 def changed_ref(ref: SampleRef, kind: str, change: Numbers) -> SampleRef:
     """The reference to a sample with a change, a key of ``CHANGES``, by whose two numbers it is named."""
@@ -208,26 +161,14 @@ def changed_ref(ref: SampleRef, kind: str, change: Numbers) -> SampleRef:
     return replace(ref, name=name, files={**ref.files, kind: change})
 
 
-#: Option -> what is typed, with its two largest numbers, and an example.
-_ASKED: dict[str, tuple[str, Numbers, str]] = {
-    "--perturb": (
-        *("DEGREES,SHARE", (30, 0.9)),
-        "1.5,0.1 turns by up to 1.5 degrees and shifts by up to a tenth of the baseline.",
-    ),
-    "--drift": (
-        *("DEGREES,PIXELS", (5, 20)),
-        "0.3,1.5 turns the right camera by 0.3 degrees and moves its image by 1.5 pixels.",
-    ),
-}
-
-
 def two_numbers(text: str, option: str) -> Numbers:
     """The two numbers of ``--perturb`` or ``--drift`` as typed, each from 0 on; else ``ValueError``."""
-    names, most, cure = _ASKED[option]
+    names, most = ("DEGREES,SHARE", (30, 0.9)) if option == "--perturb" else ("DEGREES,PIXELS", (5, 20))
     parts = re.fullmatch(r"\s*(\d*\.?\d+)\s*,\s*(\d*\.?\d+)\s*", text)
     first, second = map(float, parts.groups()) if parts else (-1.0, -1.0)
     if not (0 <= first <= most[0] and 0 <= second <= most[1]):
-        bad_value(option, f"{names} with numbers in [0, {most[0]:g}] and [0, {most[1]:g}]", repr(text), cure)
+        expected = f"{names}, such as 0.3,0.1, in [0, {most[0]:g}] and [0, {most[1]:g}]"
+        bad_value(option, expected, repr(text))
     return first, second
 
 
@@ -239,9 +180,9 @@ def with_exposure(sample: StereoSample, change: Sequence[float], name: str) -> S
 
 
 def with_drifted_rig(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
-    """What a rig gives whose right camera has turned and whose right image has moved since it was calibrated.
+    """The right camera has turned, by degrees, and its image moved, by pixels, since the rig was calibrated.
 
-    Both are a homography, whatever the depth. ``change`` is degrees and pixels; the name draws axis and sign.
+    Both are a homography, whatever the depth; the name draws axis and sign.
     """
     degrees, px = change
     rng = np.random.default_rng(zlib.crc32(name.encode()))
@@ -255,10 +196,8 @@ def with_drifted_rig(sample: StereoSample, change: Sequence[float], name: str) -
     return replace(sample, name=name, right=right)
 
 
-def perturbed_pose(
-    E: np.ndarray, degrees: float, share: float, depth_m: float, rng: np.random.Generator
-) -> np.ndarray:
-    """A pose with an error of at most ``degrees`` and that ``share`` of the baseline, which stays as long.
+def perturbed_pose(E: Array, degrees: float, share: float, depth_m: float, rng: np.random.Generator) -> Array:
+    """A pose off by at most ``degrees`` and that ``share`` of the baseline, which stays as long.
 
     Every second error is of a tracker's kind: its shift makes up for its turn at the scene's depth.
     """
@@ -277,10 +216,7 @@ def perturbed_pose(
 
 
 def with_perturbed_poses(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
-    """Give the poses of a sample's right views wrongly, by at most so many degrees and share of the baseline.
-
-    The truth says how far away the scene is; the error is drawn from the name.
-    """
+    """Give the poses of the right views wrongly, by at most degrees and a share of the baseline."""
     sample.check_truth()
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     depth_m, (degrees, share) = float(np.median(sample.depth_m[sample.valid])), change
