@@ -37,10 +37,7 @@ EXAMPLES = {
 
 @dataclass(frozen=True)
 class Form:
-    """The components, and how their values become options.
-
-    ``fields`` are by the name of what they fill in; ``untouched`` are the values that they begin with.
-    """
+    """The components, ``fields`` by the name of what they fill in, and the values that they begin with."""
 
     fields: dict[str, Any]
     untouched: dict[str, Any]

@@ -12,13 +12,11 @@ from typing import Any
 import torch
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number
-from geodiff_plugin.cli.depth import Job
+from geodiff_plugin.cli.depth import Job, load_guided_prior
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.terminal import collected_warnings
 from geodiff_plugin.formats.files import upright_size
 from geodiff_plugin.formats.out import OutFolder
-from geodiff_plugin.priors import load_prior
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 #: What the page allows of an option, where that is less than the command does.
 LIMITS = {"steps": 100, "ensemble": 20, "resolution": 4096}
@@ -49,19 +47,8 @@ class Priors:
         """The pipeline, with guidance enabled and its bars off."""
         check_choice(name, "prior", self.names)
         if name not in self._loaded:
-            pipe = load_prior(name).to(self.device)
-            pipe.set_progress_bar_config(disable=True)
-            self._loaded[name] = enable_geometry_guidance(pipe)
+            self._loaded[name] = load_guided_prior(name, self.device)
         return self._loaded[name]
-
-
-def _upright_size(path: Path, name: str) -> tuple[int, int]:
-    """``(width, height)`` of a photograph that is small enough to be decoded."""
-    width, height = upright_size(path, name)
-    if width * height > MOST_MEGAPIXELS * 1_000_000:
-        expected = f"an image of at most {MOST_MEGAPIXELS} megapixels"
-        bad_value(name, expected, f"{width}x{height}", "Scale it down first, and K with it.")
-    return width, height
 
 
 def options_of(
@@ -76,23 +63,25 @@ def options_of(
 ) -> DepthOptions:
     """The fields of a visitor as options of ``geodiff depth``; ``None`` is an empty field.
 
-    ``left``, ``right`` and ``calib``, one file or one a camera, are paths; ``way`` is a key of
-    ``CAMERA_WAYS``; ``lens`` holds fx, fy, cx and cy: fy is fx, cx and cy the middle of the image where they
-    are empty. Fields that belong to another way are left out.
+    ``way`` is a key of ``CAMERA_WAYS``; fields of another are left out. In ``lens`` fy is fx, and cx and cy
+    the middle of the image, where they are empty.
     """
-    for side, path in (("left", left), ("right", right)):
+    paths, sizes = [], []
+    for name, path in (("the left photograph", left), ("the right photograph", right)):
         if path is None:
-            bad_value(f"the {side} photograph", "given", "nothing", "Drop a picture into its field.")
-    assert left is not None and right is not None
-    sizes = [_upright_size(Path(p), f"the {s} photograph") for p, s in ((left, "left"), (right, "right"))]
+            bad_value(name, "given", "nothing", "Drop a picture into its field.")
+        width, height = upright_size(path, name)
+        if width * height > MOST_MEGAPIXELS * 1_000_000:
+            expected = f"an image of at most {MOST_MEGAPIXELS} megapixels"
+            bad_value(name, expected, f"{width}x{height}", "Scale it down first, and K with it.")
+        paths.append(Path(path))
+        sizes.append((width, height))
     given = {name: value for name, value in (lens or {}).items() if value is not None}
     if way == "file" and not calib:
         cure = "Choose one, or give focal length and baseline."
         bad_value("calibration", "a calibration file", "none", cure)
-    if way == "numbers" and ("fx" not in given or baseline is None):
-        missing = [
-            name for name, has in (("fx", "fx" in given), ("baseline", baseline is not None)) if not has
-        ]
+    missing = [name for name, value in (("fx", given.get("fx")), ("baseline", baseline)) if value is None]
+    if way == "numbers" and missing:
         bad_value(" and ".join(missing), "given", "nothing", "fx is in pixels, the baseline in metres.")
     if way == "photographs" and baseline is None:
         cure = "Photographs have no unit: measure how far the two cameras were from each other, in metres."
@@ -101,8 +90,8 @@ def options_of(
         middle = {c: (side - 1) / 2 for c, side in zip(("cx", "cy"), sizes[0], strict=True)}
         run |= {"fy": given["fx"]} | middle | given
     return DepthOptions(
-        left=Path(left),
-        right=Path(right),
+        left=paths[0],
+        right=paths[1],
         calib=tuple(map(Path, calib)) if way == "file" else (),
         baseline=baseline,
         cx_right=cx_right if way == "numbers" else None,
@@ -115,14 +104,9 @@ def options_of(
 def run_job(
     options: DepthOptions, priors: Priors, stop: threading.Event, report: Callable[[float, str], None]
 ) -> Job:
-    """Read, estimate, write, and say how far it is; only one job runs at a time.
+    """Read, estimate, write; ``Stopped`` before a stage or step after ``stop`` was set.
 
-    ``stop`` is looked at before every stage and after every denoising step; ``report`` is called with the
-    share that is done, [0, 1], and the name of the stage.
-
-    Raises:
-        Stopped: ``stop`` was set.
-        OSError, TypeError, ValueError: bad input, in one sentence.
+    ``report`` is called with the share that is done, [0, 1], and the name of the stage.
     """
 
     def stage(share: float, name: str) -> None:

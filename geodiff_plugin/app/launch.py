@@ -51,26 +51,18 @@ def _is_foreign(headers: dict[bytes, bytes]) -> bool:
     return bool(origin) and urlsplit(origin).netloc != headers.get(b"host", b"").decode("latin-1")
 
 
-def _own_folder() -> None:
-    """Let uploads and results lie in a folder that goes with this process."""
-    folder = tempfile.mkdtemp(prefix="geodiff-app-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    os.environ["GRADIO_TEMP_DIR"] = tempfile.tempdir = folder
-
-
 def launch_page(priors: tuple[str, ...] = ("bundled",), device: str = "auto", **options: Any) -> Any:
     """Build the page and launch it; further ``options`` are those of ``gradio.Blocks.launch``.
 
     A visitor may choose among ``priors``, named as ``load_prior`` takes them; the first is the default.
-
-    Raises:
-        OSError, ValueError: gradio is missing, no such device, or the first prior cannot be loaded.
     """
     if importlib.util.find_spec("gradio") is None:
         cure = "Install it with: pip install 'geodiff-plugin[app]'."
         refuse(f"geodiff app needs gradio, which is not installed. {cure}")
     os.environ.update(QUIET)  # gradio looks at it when it is imported
-    _own_folder()
+    folder = tempfile.mkdtemp(prefix="geodiff-app-")  # of uploads and results, which goes with this process
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ["GRADIO_TEMP_DIR"] = tempfile.tempdir = folder
     from starlette.middleware import Middleware
 
     from geodiff_plugin.app.job import Priors
@@ -92,12 +84,12 @@ def launch_page(priors: tuple[str, ...] = ("bundled",), device: str = "auto", **
     )
 
 
-def run_app(priors: tuple[str, ...], device: str, host: str, port: int | None, browser: bool) -> None:
-    """Serve until Ctrl-C, or until the process is asked to end; arguments as ``geodiff app`` takes them."""
+def run_app(prior: tuple[str, ...], device: str, host: str, port: int | None, browser: bool) -> None:
+    """Serve until Ctrl-C, or until the process is asked to end."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # so that what visitors gave is deleted
     where = {"server_name": host, "server_port": port, "inbrowser": browser, "share": False}
     try:
-        launch_page(priors, device, **where)
+        launch_page(prior, device, **where)
     except OSError as error:
         if "empty port" not in str(error):
             raise

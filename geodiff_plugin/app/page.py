@@ -250,9 +250,6 @@ def _wire_panels(panels: SimpleNamespace, state: gr.State, points: gr.State, tab
         x, y = (round(number * scale_of(job)) for number in numbers)
         return redraw(job, [*pixels, (x, y)][-len(NAMES) :])
 
-    def clear(job: Job | None) -> tuple[Any, ...]:
-        return redraw(job, [])
-
     def turn(job: Job | None, pixels: Pixels, event: gr.SelectData) -> dict[Any, Any]:
         """What is made when its tab is opened."""
         shown: dict[Any, Any] = {tab: event.value}
@@ -266,7 +263,7 @@ def _wire_panels(panels: SimpleNamespace, state: gr.State, points: gr.State, tab
     measured = [points, panels.picture, panels.readings]
     panels.picture.select(click, [state, points], measured, **QUICK)
     gr.on([panels.add.click, panels.pixel.submit], add, [state, points, panels.pixel], measured, **QUICK)
-    panels.clear.click(clear, state, measured, **QUICK)
+    panels.clear.click(lambda job: redraw(job, []), state, measured, **QUICK)
     shows = [tab, panels.scene, panels.points, panels.files]
     panels.tabs.select(turn, [state, points], shows, **QUICK)
 

@@ -13,7 +13,7 @@ import torch
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin._threads import available_cores
-from geodiff_plugin.capture.options import NEIGHBOURS, POINTS
+from geodiff_plugin.capture import NEIGHBOURS, POINTS
 from geodiff_plugin.formats.captures import CaptureFiles, CaptureFrame, read_capture
 from geodiff_plugin.formats.depth import read_depth_png
 from geodiff_plugin.formats.images import read_image

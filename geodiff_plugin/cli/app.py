@@ -17,9 +17,8 @@ from typing import Annotated, Any
 
 import typer
 
-from geodiff_plugin.capture.options import CaptureOptions
 from geodiff_plugin.cli.commands import Command, new_group
-from geodiff_plugin.cli.options import DepthOptions, start_pair
+from geodiff_plugin.cli.options import CaptureOptions, DepthOptions, start_pair
 from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, StopWatch
 from geodiff_plugin.formats.out import free_folder
 from geodiff_plugin.options import OUTPUT, SPACES, declare, help_of
@@ -51,28 +50,28 @@ def _with_folder(options: DepthOptions, default: str) -> DepthOptions:
     return replace(options, out=Path(default) if options.overwrite else free_folder(Path(default)))
 
 
-def _leave(failed: bool) -> None:
-    if failed:
-        sys.exit(EXIT_SOME_FAILED)
-
-
 def _depth(options: DepthOptions) -> None:
     from geodiff_plugin.cli.pairs import is_many, start_many
     from geodiff_plugin.formats.recordings import is_bag
 
-    if is_bag(options.left):
-        return _leave(_imported("cli.many.run_bag")(options))
-    names = ("topic_left", "topic_right")
-    options.refuse(names, "left out where LEFT is no bag", "given", "Images are LEFT and RIGHT.")
-    if is_many(options.left):
+    bag, failed = is_bag(options.left), False
+    if not bag:
+        names = ("topic_left", "topic_right")
+        options.refuse(names, "left out where LEFT is no bag", "given", "Images are LEFT and RIGHT.")
+    if bag:
+        failed = _imported("cli.many.run_bag")(options)
+    elif is_many(options.left):
         options = replace(options, out=options.out or Path("geodiff-out"))
         refs = start_many(options)
-        return _leave(_imported("cli.many.run_many")(options, refs))
-    options, watch = _with_folder(options, "geodiff-out"), StopWatch()
-    with start_pair(options) as folder:
-        with watch.stage("start"):
-            run = _imported("cli.depth.run_depth")
-        run(options, folder, watch)
+        failed = _imported("cli.many.run_many")(options, refs)
+    else:
+        options, watch = _with_folder(options, "geodiff-out"), StopWatch()
+        with start_pair(options) as folder:
+            with watch.stage("start"):
+                run = _imported("cli.depth.run_depth")
+            run(options, folder, watch)
+    if failed:
+        sys.exit(EXIT_SOME_FAILED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,15 +124,11 @@ class _Submit:
 
 @dataclass(frozen=True, kw_only=True)
 class _Page:
-    prior: tuple[str, ...] = declare((), "A prior that visitors may choose; repeatable.")
+    prior: tuple[str, ...] = declare(("bundled",), "A prior that visitors may choose; repeatable.")
     device: str = declare("auto", help_of("device"))
     host: str = declare("127.0.0.1", "Address to listen on; 0.0.0.0 lets other machines in.")
     port: int | None = declare(None, "Port; by default the first free one.", low=1, high=65535)
     browser: bool = declare(False, "Open the page in a browser.")
-
-    def run(self) -> None:
-        run = _imported("app.launch.run_app")
-        run(self.prior or ("bundled",), self.device, self.host, self.port, self.browser)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,19 +148,21 @@ class _Convert:
     )
 
 
-def _capture(options: CaptureOptions) -> None:
-    _imported("cli.capture.run_and_report")(options)
-
-
 COMMANDS = {
     "depth": Command(DepthOptions, _depth, "Metric depth of LEFT guided by RIGHT; of one pair, or of many."),
-    "capture": Command(CaptureOptions, _capture, "Depth of a capture's frames, and one cloud of all."),
+    "capture": Command(
+        CaptureOptions,
+        lambda options: _imported("cli.capture.run_capture")(options),
+        "Depth of a capture's frames, and one cloud of all.",
+    ),
     "demo": Command(_Demo, _Demo.run, "Run on a rendered pair of the package, and print how good it is."),
     "info": Command(_Info, _later("cli.info.run_info"), "Versions, devices, priors and what is cached."),
     "bench": Command(_Bench, _later("cli.demo.run_bench"), "What guidance costs in seconds and memory."),
     "video": Command(_Video, _later("cli.results.run_video"), "Join depth maps of a sequence into a video."),
     "submit": Command(_Submit, _later("cli.results.run_submit"), "Write what Middlebury and ETH3D take."),
-    "app": Command(_Page, _Page.run, "Serve a web page on which to measure (needs the extra app)."),
+    "app": Command(
+        _Page, _later("app.launch.run_app"), "Serve a web page on which to measure (needs the extra app)."
+    ),
     "convert": Command(_Convert, _later("cli.convert.run_convert"), "Make a folder for --prior of weights."),
     "eval": Command(None, lambda _: _imported("cli.eval.eval_app"), "Measure it and others on data sets."),
 }

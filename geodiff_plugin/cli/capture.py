@@ -1,28 +1,340 @@
-"""``geodiff capture``: depth of the frames of a walk with a camera."""
+"""``geodiff capture``: poses once, depth of every chosen frame, agreement, one cloud of all."""
 
 from __future__ import annotations
 
 import json
+import math
+import multiprocessing
+import os
 import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from geodiff_plugin.capture.options import CaptureOptions
-from geodiff_plugin.capture.run import run_capture
-from geodiff_plugin.cli.outputs import write_maps
+import numpy as np
+import psutil  # comes with accelerate
+import torch
+
+from geodiff_plugin import __version__
+from geodiff_plugin._checks import InputError, bad_value, check_positive
+from geodiff_plugin._threads import WithinCores, available_cores
+from geodiff_plugin.capture.capture import Capture
+from geodiff_plugin.capture.results import ALONE, write_agreement, write_results
+from geodiff_plugin.cli.depth import load_guided_prior
+from geodiff_plugin.cli.options import CaptureOptions
+from geodiff_plugin.cli.outputs import single_map, write_maps
 from geodiff_plugin.cli.terminal import collected_warnings, say
+from geodiff_plugin.formats.depth import read_map
+from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
+from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, write_text
+from geodiff_plugin.pose.capture import Observations, SolvedCapture
+from geodiff_plugin.runner import BROKEN, Item, Journal, Runner, fingerprint, this_process
+from geodiff_plugin.runtime.machine import pick_device
+from geodiff_plugin.types import MetricDepthOutput
+
+POSES_FILE, SCALE_FILE, JOURNAL = "poses.npz", "scale.json", "frames.jsonl"
+#: What the poses depend on, and beside them the depth of a frame.
+OF_POSES = ("poses", "k", "fov", "trajectory")
+OF_SCALE = ("metres_per_unit", "known_length", "distance")
+OF_FRAME = ("neighbours", "points", *OF_SCALE, "prior", "prior_map", "space", "steps", "seed")
+#: Memory that one process of the bundled prior takes at 640x480, bytes; what a larger prior takes is unknown.
+PROCESS_BYTES = 1.5e9
+Record = dict[str, Any]
 
 
-def run_and_report(options: CaptureOptions) -> None:
+def _key(capture: Capture, options: CaptureOptions, *of: str) -> str:
+    """A digest of the settings ``of`` and the frames that a result depends on."""
+    said = {name: str(getattr(options, name)) for name in of}
+    return fingerprint(said, __version__, capture.names, str(options.path.resolve()))
+
+
+def open_capture(options: CaptureOptions) -> Capture:
+    """The capture of the options, without poses solved."""
+    K = None if options.k is None else read_matrix(options.k, "--K")
+    capture = Capture.open(options.path, K=K, fov=options.fov, trajectory=options.trajectory)
+    if options.poses == "given" and capture.poses is None:
+        bad_value("--poses given", "used with a capture that has poses", f"{options.path} without")
+    _length(capture, options)
+    return capture
+
+
+def solved_poses(capture: Capture, options: CaptureOptions) -> None:
+    """Solve for the poses, or take those that an earlier run of the same capture left; then set the scale."""
+    path, key = options.out / POSES_FILE, _key(capture, options, *OF_POSES)
+    solved = None if options.overwrite else load_solved(path, key)
+    if solved is None:
+        solved = capture.solve(options.poses, threads=available_cores())
+        _save_solved(path, solved, key)
+    capture.solved = solved
+    factor = _factor(capture, options, key)
+    if factor is not None:
+        capture.rescale(factor)
+
+
+def _save_solved(path: Path, solved: SolvedCapture, key: str) -> None:
+    """Write everything as ``.npz``, under the key of the frames and settings that it is of."""
+    arrays = {f.name: getattr(solved, f.name) for f in fields(solved) if f.name not in ("seen", "notes")}
+    arrays["E_given"] = np.zeros(0) if solved.E_given is None else solved.E_given
+    arrays["px"] = np.concatenate([seen.px for seen in solved.seen])
+    arrays["point"] = np.concatenate([seen.point for seen in solved.seen])
+    arrays["counts"] = np.array([len(seen.point) for seen in solved.seen])
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, key=np.array(key), notes=np.array(solved.notes, np.str_), **arrays)
+
+
+def load_solved(path: Path, key: str) -> SolvedCapture | None:
+    """What was saved; ``None`` where there is none of that key."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        if str(arrays.pop("key")) != key:
+            return None
+        cuts = np.cumsum(arrays.pop("counts"))[:-1]
+        px, point = np.split(arrays.pop("px"), cuts), np.split(arrays.pop("point"), cuts)
+        values: dict[str, Any] = {n: a.item() if a.ndim == 0 else a for n, a in arrays.items()}
+        values["E_given"] = values["E_given"] if values["E_given"].size else None
+        values["notes"] = tuple(map(str, values["notes"]))
+        return SolvedCapture(seen=tuple(map(Observations, px, point)), **values)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _length(capture: Capture, options: CaptureOptions) -> tuple[list[str], np.ndarray, float] | None:
+    """Frames of ``--distance``, or frame and two pixels of ``--known-length``, and the metres between."""
+    if options.distance is not None:
+        option, typed, form = "--distance", options.distance, "NAME,NAME,METRES"
+        *names, metres = (word.strip() for word in typed.split(","))
+        words = [metres]
+    elif options.known_length is not None:
+        option, typed, form = "--known-length", options.known_length, "NAME:X1,Y1,X2,Y2,METRES"
+        name, _, rest = typed.rpartition(":")
+        names, words = [name], rest.split(",")
+    else:
+        return None
+    try:
+        *numbers, length = map(float, words)
+    except ValueError:
+        numbers, length = [math.nan], math.nan
+    if (len(names), len(numbers)) not in ((2, 0), (1, 4)):
+        bad_value(option, form, repr(typed))
+    check_positive(length, option, "metres")
+    ends, (width, height) = np.array(numbers).reshape(-1, 2), capture.frame(names[0]).size
+    if not ((ends >= 0) & (ends <= (width - 1, height - 1))).all():
+        bad_value(option, f"pixels of {width}x{height}", repr(typed))
+    return [capture.frame(name).name for name in names], ends, length
+
+
+def _factor(capture: Capture, options: CaptureOptions, key: str) -> float | None:
+    """Metres per unit of the poses; that of ``--known-length`` by the depth of its frame, found once."""
+    given = _length(capture, options)
+    if given is None:
+        return options.metres_per_unit
+    names, ends, metres = given
+    solved, numbers = capture.solve(), [capture.names.index(name) for name in names]
+    if options.distance is not None:
+        apart = float(np.linalg.norm(np.diff(solved.E[numbers, :3, 3], axis=0)))
+        if not apart > 0:
+            bad_value("--distance", "of two frames with different positions", repr(options.distance))
+        return metres / apart
+    path, asked = options.out / SCALE_FILE, f"{key} {options.known_length}"
+    try:
+        saved = json.loads(path.read_text(encoding="utf-8"))
+        if saved["of"] == asked and not options.overwrite:
+            return float(saved["metres_per_unit"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    depth = single_map(_depth(capture, _pipe(options), names[0], options).prediction)
+    rays = np.linalg.solve(solved.K[numbers[0]], np.c_[ends, np.ones(2)].T).T
+    points = rays * depth[tuple(np.rint(ends).astype(int).T[::-1])][:, None]
+    factor = metres / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
+    write_text(path, json.dumps({"metres_per_unit": factor, "of": asked}) + "\n")
+    return factor
+
+
+def _pipe(options: CaptureOptions) -> Any:
+    prior = "map" if options.prior_map is not None else options.prior
+    return load_guided_prior(prior, pick_device(options.device), options.space)
+
+
+def _depth(
+    capture: Capture, pipe: Any, name: str, options: CaptureOptions, points: str = "none"
+) -> MetricDepthOutput:
+    """Depth of one frame as the options say."""
+    call: dict[str, Any] = {} if options.steps is None else {"num_inference_steps": options.steps}
+    if options.prior_map is not None:
+        path = find_map(options.prior_map, name) or options.prior_map / f"{name}{MAP_SUFFIXES[0]}"
+        call["depth_map"] = read_map(path, f"--prior-map of {name}")
+    with torch.no_grad():
+        return capture.depth(pipe, name, options.neighbours, seed=options.seed, points=points, **call)
+
+
+def _write_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[], Any], item: Item) -> Record:
+    """One frame: its files, and its report."""
+    name, pipe, started = item.key, loaded(), time.perf_counter()
+    output = _depth(capture, pipe, name, options, options.points)
+    depth, sure = single_map(output.prediction), output.confidence
+    confidence = np.full_like(depth, 0.5) if sure is None else single_map(sure)
+    solved, number = capture.solve(), capture.names.index(name)
+    low, middle, high = (float(v) for v in np.percentile(depth, (2, 50, 98)))
+    report = {
+        "version": __version__,
+        "frame": name,
+        "neighbours": capture.neighbours(name, options.neighbours),
+        "unit": output.unit,
+        "K": np.asarray(output.K)[0].tolist(),
+        "T_world_from_camera": solved.E[number].tolist(),
+        "connected": bool(solved.connected[number]),
+        "scale_spread": _rounded(solved.scale_spread),
+        "depth": {"p02": low, "median": middle, "p98": high},
+        "poses": [pose.status for pose in output.poses],
+        "trusted": [bool(verdict.trusted) for verdict in output.verdicts],
+        "warnings": list(output.warnings),
+    }
+
+    def fill(folder: Path) -> None:
+        report["files"] = write_maps(folder, output, capture.image(name))
+        for file, values in zip(ALONE, (depth, confidence), strict=True):
+            np.save(folder / f"{file}.npy", values.astype(np.float32))
+        report["seconds"] = round(time.perf_counter() - started, 2)
+        write_text(folder / REPORT, json.dumps(report, indent=2) + "\n")
+
+    with OutFolder(options.out / name, overwrite=True) as out:
+        out.write(fill)
+    return report
+
+
+def _rounded(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None
+
+
+def _run_frames(capture: Capture, options: CaptureOptions, names: Sequence[str]) -> list[Record]:
+    """Depth of every chosen frame that is not done yet, by one process a core.
+
+    Returns the reports in the order of the names; ``{"key", "status": "broken", "error"}`` of a frame that
+    failed. ``InputError`` if every frame failed for one reason.
+    """
+    if options.overwrite:
+        (options.out / JOURNAL).unlink(missing_ok=True)
+    items = _items(capture, options, names)
+    journal = Journal(options.out / JOURNAL)
+    left = sum(journal.get(item) is None for item in items)
+    journal.close()
+    on_cpu = pick_device(options.device).type == "cpu"
+    held = int(psutil.virtual_memory().available / PROCESS_BYTES)  # by the memory
+    wanted = options.processes or (min(available_cores(), max(1, held)) if on_cpu else 1)
+    count = max(1, min(wanted, left)) if this_process().count == 1 else 1
+    context = multiprocessing.get_context("spawn")
+    more = [
+        context.Process(target=_help, args=(options, names, i, count), daemon=True) for i in range(1, count)
+    ]
+    for process in more:
+        process.start()
+    try:
+        return _work(capture, options, items, count)
+    finally:
+        for process in more:
+            process.terminate()
+            process.join()
+
+
+def _items(capture: Capture, options: CaptureOptions, names: Sequence[str]) -> list[Item]:
+    key = _key(capture, options, *OF_POSES, *OF_FRAME)
+    return [Item(name, inputs=key) for name in names]
+
+
+def _work(capture: Capture, options: CaptureOptions, items: Sequence[Item], count: int) -> list[Record]:
+    """The part of the frames of one of ``count`` processes."""
+    runner = Runner(
+        items,
+        Journal(options.out / JOURNAL),
+        noun="frame",
+        survives=(InputError, OSError, ValueError, RuntimeError),
+        progress=not options.quiet,
+        whole=lambda item, _: all((options.out / item.key / f"{file}.npy").is_file() for file in ALONE),
+    )
+    with WithinCores(count):
+        return runner.run(partial(_write_frame, capture, options, cache(partial(_pipe, options))))
+
+
+def _help(options: CaptureOptions, names: Sequence[str], index: int, count: int) -> None:
+    """Another process of the same run, which takes frames that nobody has taken."""
+    os.environ.update(RANK=str(index), WORLD_SIZE=str(count), LOCAL_RANK="0")
+    options = replace(options, overwrite=False, quiet=True)
+    capture = open_capture(options)
+    solved_poses(capture, options)
+    _work(capture, options, _items(capture, options, names), count)
+
+
+def capture_report(options: CaptureOptions) -> Record:
+    """Everything of the command but its answer on stdout: poses, frames, and the report, ``capture.json``."""
+    started = time.perf_counter()
+    capture = open_capture(options)
+    names = capture.choose(options.frames)
+    for note in capture.files.notes:
+        say(note)
+    options.out.mkdir(parents=True, exist_ok=True)
+    solved_poses(capture, options)
+    seconds = {"poses": round(time.perf_counter() - started, 1)}
+    solved = capture.solve()
+    if not options.quiet:
+        say(f"poses {solved.status}: matches lie {solved.residual_px:.2f} px off their epipolar lines")
+    for note in solved.notes:
+        say(f"warning: {note}")
+    frames = _run_frames(capture, options, names)
+    seconds["frames"] = round(time.perf_counter() - started - seconds["poses"], 1)
+    done = [report["frame"] for report in frames if report.get("status") != BROKEN]
+    agreement = write_agreement(capture, options.out, done)
+    files = write_results(capture, options.out, done, options.export)
+    seconds["agreement and cloud"] = round(time.perf_counter() - started - sum(seconds.values()), 1)
+    report = {
+        "version": __version__,
+        "path": str(options.path),
+        "kind": capture.files.kind,
+        "unit": capture.unit,
+        "poses": _pose_report(capture),
+        "seconds": seconds,
+        "files": files,
+        "agreement": agreement,
+        "frames": frames,
+    }
+    write_text(options.out / "capture.json", json.dumps(report, indent=2) + "\n")
+    return report
+
+
+def _pose_report(capture: Capture) -> Record:
+    """What the solve did."""
+    solved = capture.solve()
+    numbers = {
+        "residual_px_given": solved.residual_px_given,
+        "residual_px": solved.residual_px,
+        "scale_by_positions": solved.scale_trajectory,
+        "scale_by_depth": solved.scale_depth,
+        "scale_spread": solved.scale_spread,
+    }
+    rounded = {name: _rounded(value) for name, value in numbers.items()}
+    each = zip(capture.names, solved.connected, *solved.moved(), strict=True)
+    frames = {
+        name: {"connected": bool(c), "moved": round(float(m), 5), "turned_deg": round(float(t), 3)}
+        for name, c, m, t in each
+        if math.isfinite(m)
+    }
+    return {"status": solved.status, **rounded, "notes": list(solved.notes), "frames": frames}
+
+
+def run_capture(options: CaptureOptions) -> None:
     """Depth of every frame, the answer on stdout, and exit code 1 where a frame failed."""
     with collected_warnings():
-        report = run_capture(options, write_maps, say)
-    print(json.dumps(report, indent=2) if options.json else _summary(report, options.out))
+        report = capture_report(options)
+    print(json.dumps(report, indent=2) if options.json else summary(report, options.out))
     if any("error" in frame for frame in report["frames"]):
         sys.exit(1)
 
 
-def _summary(report: dict[str, Any], out: Path) -> str:
+def summary(report: Record, out: Path) -> str:
+    """One line for people."""
     depths = sorted(frame["depth"]["median"] for frame in report["frames"] if "error" not in frame)
     line = f"{len(depths)} of {len(report['frames'])} frames"
     if depths:

@@ -2,23 +2,76 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
+import pickle
+import re
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from diffusers import AutoencoderKL, FlowMatchEulerDiscreteScheduler, UNet2DConditionModel
+from diffusers import __version__ as diffusers_version
+from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from transformers import Dinov2Config, Dinov2Model
 
 from geodiff_plugin._checks import InputError, bad_value
-from geodiff_plugin.cli.converters import depthfm, ppd, read_checkpoint, save_weights
-from geodiff_plugin.cli.converters.marigold_v2 import MARIGOLD_V2, convert_marigold_v2
+from geodiff_plugin.priors.components import FixedPrompt
+from geodiff_plugin.priors.depthfm import DepthFMPipeline
+from geodiff_plugin.priors.loading import Layout, check_weights, load_component, reading
+from geodiff_plugin.priors.marigold_v2 import SPACE_OF_CHECKPOINT, MarigoldV2Pipeline
+from geodiff_plugin.priors.ppd import PixelDiT, PPDPipeline
 
-#: Kind -> module with the ``KEYS`` that tell it, and ``write(checkpoint, folder, part)``.
-CONVERTERS = {"depthfm": depthfm, "ppd": ppd}
+_reconstruct = importlib.import_module("numpy._core.multiarray")._reconstruct
+#: A numpy array in a checkpoint is rebuilt by these; files of numpy 1 call the module ``numpy.core``.
+NUMPY_PARTS: list[Any] = [
+    (_reconstruct, "numpy.core.multiarray._reconstruct"),
+    (_reconstruct, "numpy._core.multiarray._reconstruct"),
+    np.ndarray,
+    np.dtype,
+    *(type(np.dtype(name)) for name in ("float16", "float32", "float64", "int64")),
+]
 #: Keys of an unknown checkpoint that the error names.
 NAMED_KEYS = 8
 #: What is copied beside weights: configs, vocabularies, licences.
 COPIED = (".json", ".txt", ".md", ".model", ".safetensors")
+
+#: A copy of runwayml/stable-diffusion-v1-5, which DepthFM's authors name and which is gone.
+VAE_ID = "stable-diffusion-v1-5/stable-diffusion-v1-5"
+#: What diffusers' conversion expects before every name.
+LDM_PREFIX = "model.diffusion_model."
+
+#: Of ``ppd.pth``: its transformer, and the encoder whose tokens that takes, as transformers has it.
+TRANSFORMER, ENCODER_ID = "dit.", "depth-anything/Depth-Anything-V2-Large-hf"
+SIZES = ("hidden_size", "num_hidden_layers", "num_attention_heads", "mlp_ratio", "image_size", "patch_size")
+
+MARIGOLD_V2, TRAINABLES = "marigold-v2", "trainables.safetensors"
+PROMPT_FOLDER, PROMPT = "qwen_text_embeddings", "qwen_edit_2509_qwen_depth_realimg512"
+INDEX = "diffusion_pytorch_model.safetensors.index.json"
+#: What loads the parts that are written, but for the space; they are never in memory together.
+INDEX_OF_PRIOR: dict[str, Any] = {
+    "_class_name": MarigoldV2Pipeline.__name__,
+    "_diffusers_version": diffusers_version,
+    "transformer": ["diffusers", "QwenImageTransformer2DModel"],
+    "vae": ["diffusers", "AutoencoderKLQwenImage"],
+    "scheduler": ["diffusers", "FlowMatchEulerDiscreteScheduler"],
+    "prompt": [FixedPrompt.__module__, FixedPrompt.__name__],
+    "sample_latent": False,
+    "default_denoising_steps": 1,
+    "default_processing_resolution": 768,
+}
+#: Component in the checkpoint -> folder in the base.
+FOLDERS = {"Diffuser": "transformer", "VAE": "vae"}
+#: Names in the checkpoint -> those in the base, of a LoRA's factors with ``" A"`` or ``" B"`` behind.
+NAMES = ((r"\.base_layer\.", "."), (r"\.lora_([AB])(\.default)?\.weight$", r".weight \1"))
 
 
 def run_convert(paths: Sequence[Path], part: str | None = None, space: str | None = None) -> None:
@@ -43,7 +96,7 @@ def run_convert(paths: Sequence[Path], part: str | None = None, space: str | Non
     kind = MARIGOLD_V2 if layered else "folder"
     try:
         if layered:
-            convert_marigold_v2(paths[1], source, unfinished, part, space)
+            _convert_marigold_v2(paths[1], source, unfinished, part, space)
         elif os.path.isdir(source):
             _convert_folder(source, unfinished)
         else:
@@ -60,16 +113,50 @@ def run_convert(paths: Sequence[Path], part: str | None = None, space: str | Non
     print(f"{source} ({kind}) -> {target}; use it with --prior {target}")
 
 
-def _convert_file(source: Path, folder: Path, part: str | None) -> str:
-    """Convert a checkpoint into an empty folder; what kind it was."""
-    checkpoint = read_checkpoint(source)
-    for kind, converter in CONVERTERS.items():
-        if set(checkpoint) >= converter.KEYS:
-            converter.write(checkpoint, folder, part)
-            return kind
-    got = f"{source} with the keys {', '.join(map(str, list(checkpoint)[:NAMED_KEYS])) or 'of nothing'}"
-    cure = "docs/reference/priors.md tells which prior comes from where."
-    bad_value("SRC", f"a checkpoint of a known kind ({', '.join(CONVERTERS)})", got, cure)
+def _read_checkpoint(path: Path, kind: type[Any] = Mapping) -> Any:
+    """What ``torch.save`` put into a file, on the CPU: a mapping, or a ``kind``; nothing in it is run."""
+    if not os.path.isfile(path):
+        bad_value("SRC", "a checkpoint file or a folder in diffusers' layout", path, "Check the path.")
+    try:
+        with torch.serialization.safe_globals(NUMPY_PARTS):
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, ValueError, OSError) as error:
+        got = "one that cannot be read (is it cut off?)"  # torch's own advice may be to run its code
+        cure = "Fetch it anew and compare its size with the original's."
+        if "GLOBAL" in str(error) or "Unsupported class" in str(error):
+            got = "one that cannot be read (it holds more than tensors, numbers and text)"
+            cure = "Unpickling it would run code, which is never done: ask its authors for safetensors."
+        bad_value(str(path), "a checkpoint written by torch.save", got, cure)
+    if not isinstance(content, kind):
+        bad_value(str(path), f"a checkpoint that holds a {kind.__name__.lower()}", type(content).__name__)
+    return content
+
+
+def _part(state: Mapping[Any, Any], prefix: str) -> dict[str, Any]:
+    """The weights whose names start with ``prefix``, without it."""
+    named = ((str(key), value) for key, value in state.items())
+    return {key.removeprefix(prefix): value for key, value in named if key.startswith(prefix)}
+
+
+def _save_weights(state: Mapping[str, Tensor], path: Path) -> None:
+    """Write safetensors, which refuse tensors that share memory (tied weights) or have gaps."""
+    apart = {name: value.clone(memory_format=torch.contiguous_format) for name, value in state.items()}
+    save_file(apart, path, metadata={"format": "pt"})
+
+
+def _fixed_prompt(embedding: Tensor) -> FixedPrompt:
+    """The component that holds a prompt's embedding ``(1, n, C)``."""
+    prompt = FixedPrompt(*embedding.shape[1:])
+    prompt.load_state_dict({"embedding": embedding.float()})
+    return prompt
+
+
+def _write_card(folder: Path, licence: str, text: str) -> None:
+    """``README.md``: the licence where it is looked for on load, and where the weights come from."""
+    (folder / "README.md").write_text(f"---\nlicense: {licence}\n---\n\n{text}\n", encoding="utf-8")
+
+
+# A folder with .bin files
 
 
 def _safe_name(name: str) -> str:
@@ -89,10 +176,254 @@ def _convert_folder(source: Path, folder: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".bin":
             if not (source / safe.relative_to(folder)).is_file():  # else it is copied
-                save_weights(read_checkpoint(path), safe)
+                _save_weights(_read_checkpoint(path), safe)
         elif path.name.endswith(".bin.index.json"):
             index = json.loads(path.read_text(encoding="utf-8"))
             index["weight_map"] = {key: _safe_name(name) for key, name in index["weight_map"].items()}
             safe.write_text(json.dumps(index, indent=2), encoding="utf-8")
         elif path.suffix in COPIED or path.name.upper().startswith("LICEN"):
             shutil.copyfile(path, target)
+
+
+# depthfm-v1.ckpt: CompVis' U-Net and empty prompt; the VAE is Stable Diffusion 1.5's
+
+
+def unet_config(hparams: Mapping[str, Any]) -> dict[str, Any]:
+    """Config of ``UNet2DConditionModel`` for the options of a CompVis ``UNetModel``.
+
+    Options that change the weights' names or shapes in another way are noticed when these are loaded.
+    """
+    width, mults = hparams["model_channels"], hparams["channel_mult"]
+    attends = [2**level in set(hparams["attention_resolutions"]) for level in range(len(mults))]
+    kinds = ["CrossAttn" if attending else "" for attending in attends]
+    return {
+        "in_channels": hparams["in_channels"],
+        "out_channels": hparams["out_channels"],
+        "layers_per_block": hparams["num_res_blocks"],
+        "cross_attention_dim": hparams["context_dim"],
+        "block_out_channels": tuple(width * mult for mult in mults),
+        "use_linear_projection": hparams.get("use_linear_in_transformer", False),
+        # diffusers' name for the number of heads, for reasons of its history.
+        "attention_head_dim": hparams["num_heads"],
+        "down_block_types": tuple(f"{kind}DownBlock2D" for kind in kinds),
+        "up_block_types": tuple(f"{kind}UpBlock2D" for kind in reversed(kinds)),
+    }
+
+
+def _write_depthfm(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:
+    state, config = checkpoint["state_dict"], unet_config(checkpoint["ldm_hparams"])
+    unet = UNet2DConditionModel(**config)
+    wanted = unet.state_dict().keys()
+    converted = convert_ldm_unet_checkpoint({LDM_PREFIX + k: v for k, v in state.items()}, config)
+    fitting = {name: value for name, value in converted.items() if name in wanted}
+    taken = {id(value) for value in fitting.values()}
+    unexpected = [name for name, value in state.items() if id(value) not in taken]
+    check_weights(wanted - fitting.keys(), unexpected, "the checkpoint's state_dict")
+    unet.load_state_dict(fitting)
+    source = part or VAE_ID
+    expected = "a folder or hub id of Stable Diffusion 1.5, or of its VAE (the checkpoint has none)"
+    subfolder = "" if (Path(source) / "config.json").is_file() else "vae"
+    with reading("--with", expected, repr(source), f"Fetch it once: hf download {VAE_ID}."):
+        vae = AutoencoderKL.from_pretrained(source, subfolder=subfolder, use_safetensors=True)
+    embedding = torch.as_tensor(checkpoint["empty_text_embedding"])
+    prompt = _fixed_prompt(embedding.reshape(1, *embedding.shape[-2:]))
+    noising_step, scheduler = int(checkpoint["noising_step"]), FlowMatchEulerDiscreteScheduler()
+    DepthFMPipeline(unet, vae, scheduler, prompt, noising_step=noising_step).save_pretrained(folder)
+    _write_card(
+        folder,
+        "mit",
+        "DepthFM (CompVis/depth-fm), converted by `geodiff convert`. The VAE is that of Stable Diffusion 1.5 "
+        "and the U-Net was fine-tuned from it, so its CreativeML Open RAIL-M licence applies as well.",
+    )
+
+
+# ppd.pth: a transformer on pixels, with the encoder of Depth Anything V2 Large
+
+
+def _load_encoder(part: str | None) -> Dinov2Model:
+    """The encoder out of the folder that ``--with`` names, every weight in its place."""
+    source = Path(part or "")
+    config, weights = source / "config.json", source / "model.safetensors"
+    expected = f"a folder of {ENCODER_ID}: the encoder whose tokens ppd.pth needs"
+    cure = f"Fetch it once: hf download {ENCODER_ID} --local-dir da2. ppd_moge.pth needs another."
+    if not (config.is_file() and weights.is_file()):
+        bad_value("--with", expected, part or "nothing", cure)
+    with reading("--with", expected, str(source), cure):
+        backbone = json.loads(config.read_text(encoding="utf-8"))["backbone_config"]
+        sizes = {name: backbone[name] for name in SIZES if name in backbone}
+        state = _part(load_file(weights), "backbone.")
+    with tempfile.TemporaryDirectory() as folder:
+        # Through a file: transformers renames on loading, and which names are its own differs by its version.
+        _save_weights({name: v.float() for name, v in state.items()}, Path(folder) / "model.safetensors")
+        Dinov2Config(**sizes, architectures=["Dinov2Model"]).save_pretrained(folder)
+        return load_component(Layout(Path(folder), str(source)), "", Dinov2Model, torch.float32)
+
+
+def _load_transformer(state: Mapping[str, Tensor]) -> PixelDiT:
+    """The transformer, of the size that its weights have."""
+    width, _, side, _ = state["x_embedder.proj.weight"].shape
+    head_size = state["blocks.0.attn.q_norm.weight"].shape[0]
+    fusion = state["proj_fusion.0.weight"].shape[1]
+    hidden = state["blocks.0.mlp.fc1.weight"].shape[0]
+    blocks = {name.split(".")[1] for name in state if name.startswith("blocks.")}
+    dit = PixelDiT(width, len(blocks), width // head_size, side // 2, fusion - width, hidden / width)
+    wanted = set(dit.state_dict())
+    check_weights(wanted - set(state), set(state) - wanted, "the checkpoint")
+    dit.load_state_dict(state)
+    return dit.eval()
+
+
+def _write_ppd(checkpoint: Mapping[str, Any], folder: Path, part: str | None) -> None:
+    dit, encoder = _load_transformer(_part(checkpoint, TRANSFORMER)), _load_encoder(part)
+    if encoder.config.hidden_size != dit.config.semantic_size:
+        expected = f"{dit.config.semantic_size} wide, as the checkpoint's tokens"
+        got = f"{encoder.config.hidden_size} wide, another size of Depth Anything V2"
+        bad_value("the encoder of --with", expected, got)
+    PPDPipeline(dit, encoder, FlowMatchEulerDiscreteScheduler()).save_pretrained(folder)
+    _write_card(
+        folder,
+        "cc-by-nc-4.0",
+        "Pixel-Perfect Depth (gangweix/pixel-perfect-depth, Apache-2.0), converted by `geodiff convert`. "
+        "The encoder of Depth Anything V2 Large, without which it cannot run, is CC-BY-NC-4.0.",
+    )
+
+
+PPD_KEYS = ("x_embedder.proj", "blocks.0.attn.q_norm", "blocks.0.mlp.fc1", "proj_fusion.0")
+#: Kind -> the keys that tell it, and what fills an empty folder; the last argument is that of ``--with``.
+CONVERTERS: dict[str, tuple[set[str], Any]] = {
+    "depthfm": ({"state_dict", "ldm_hparams", "noising_step", "empty_text_embedding"}, _write_depthfm),
+    "ppd": ({f"{TRANSFORMER}{name}.weight" for name in PPD_KEYS}, _write_ppd),
+}
+
+
+def _convert_file(source: Path, folder: Path, part: str | None) -> str:
+    """Convert a checkpoint into an empty folder; what kind it was."""
+    checkpoint = _read_checkpoint(source)
+    for kind, (keys, write) in CONVERTERS.items():
+        if set(checkpoint) >= keys:
+            write(checkpoint, folder, part)
+            return kind
+    got = f"{source} with the keys {', '.join(map(str, list(checkpoint)[:NAMED_KEYS])) or 'of nothing'}"
+    cure = "docs/reference/priors.md tells which prior comes from where."
+    bad_value("SRC", f"a checkpoint of a known kind ({', '.join(CONVERTERS)})", got, cure)
+
+
+# Marigold V2 (arXiv 2609.08084): base, trained checkpoint and prompt
+
+
+def merged(name: str, weight: Tensor, trained: Mapping[str, Tensor]) -> Tensor:
+    """A weight of the base with what was trained: in its place, or added to it in float32.
+
+    Alpha is the rank in every published configuration, so the product of the factors counts once.
+    """
+    weight = trained.get(name, weight).to(weight.dtype)
+    if f"{name} A" not in trained:
+        return weight
+    return (weight.float() + trained[f"{name} B"].float() @ trained[f"{name} A"].float()).to(weight.dtype)
+
+
+def _trained(state: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
+    """What was trained of a component, by its names in the base."""
+    result = {}
+    for name, value in _part(state, f"{part}.").items():
+        for pattern, replacement in NAMES:
+            name = re.sub(pattern, replacement, name)
+        result[name] = value
+    return result
+
+
+def _check_trained(trained: Mapping[str, Tensor], base: set[str], where: str) -> None:
+    """Refuse a checkpoint of another base, by names, before anything is written."""
+    factored = {name[:-2] for name in trained if " " in name}
+    lacking = [f"{name} of factor {f}" for name in factored for f in "AB" if f"{name} {f}" not in trained]
+    check_weights(lacking, {name.partition(" ")[0] for name in trained} - base, where)
+
+
+def _base_files(base: Path, name: str) -> tuple[list[Path], set[str]]:
+    """The safetensors of a component of the base, and the names of their tensors."""
+    folder = base / name
+    if not os.path.isfile(folder / "config.json"):
+        bad_value("BASE", f"a folder of Qwen/Qwen-Image-Edit-2509 with {name}/", base, "Check the path.")
+    names = {path.name for path in folder.glob("*.safetensors")}
+    if (folder / INDEX).is_file():
+        names = set(json.loads((folder / INDEX).read_text("utf-8"))["weight_map"].values())
+    files = [folder / file for file in sorted(names)]
+    missing = [file.name for file in files if not file.is_file()]
+    if missing or not files:
+        got = f"one without {', '.join(missing)}" if missing else "one without"
+        bad_value("BASE", f"a folder with safetensors in {folder}", got, "Fetch it anew.")
+    tensors = set[str]()
+    for file in files:
+        with safe_open(file, "pt") as opened:
+            tensors |= set(opened.keys())
+    return files, tensors
+
+
+def read_prompt(folder: Path) -> Tensor:
+    """The first prompt of the two ``.pt`` files, without its padding: ``(1, n, C)``."""
+    files = (folder / f"{PROMPT}_prompt_{part}.pt" for part in ("embeds", "mask"))
+    embedding, mask = (_read_checkpoint(file, Tensor) for file in files)
+    return embedding[:1, mask[0] > 0]
+
+
+def _space(file: Path, requested: str | None) -> str:
+    """As requested, or as the checkpoint's folder is called."""
+    name = file.resolve().parent.name
+    space = requested or SPACE_OF_CHECKPOINT.get(name.split("-")[0].lower())
+    if space is None:
+        cure = "Keep the authors' folder name, or say with --space what its map is affine in."
+        bad_value("CHECKPOINT", "in a folder called Log-*, Uniform-* or Disparity-*", repr(name), cure)
+    return space
+
+
+def _prompt_folder(file: Path, requested: str | None) -> Path:
+    """As requested, or where the authors' download has it: beside ``depth/``."""
+    beside = [parent / PROMPT_FOLDER for parent in file.resolve().parents]
+    for folder in beside if requested is None else [Path(requested)]:
+        if folder.is_dir():
+            return folder
+    expected = f"the folder {PROMPT_FOLDER} of huawei-bayerlab/marigold-v2-0"
+    bad_value("--with", expected, requested or "none beside", f"Name it: --with .../{PROMPT_FOLDER}")
+
+
+def _convert_marigold_v2(
+    base: Path, checkpoint: Path, folder: Path, prompts: str | None, space: str | None
+) -> None:
+    """Write the folder of a prior; at most one file of the base is in memory.
+
+    Of the base, Qwen-Image-Edit-2509 in diffusers' layout, ``transformer/`` and ``vae/`` are read; the
+    checkpoint is a folder with ``trainables.safetensors``, or that file.
+    """
+    file = checkpoint / TRAINABLES if os.path.isdir(checkpoint) else checkpoint
+    if not os.path.isfile(file) or file.suffix != ".safetensors":
+        expected = f"a folder of huawei-bayerlab/marigold-v2-0 with {TRAINABLES}, such as depth/Log-stage2"
+        bad_value("CHECKPOINT", expected, checkpoint, "Check the path.")
+    space, prompt = _space(file, space), read_prompt(_prompt_folder(file, prompts))
+    state = load_file(file)
+    trained = {part: _trained(state, part) for part in FOLDERS}
+    files = {}
+    for part, name in FOLDERS.items():
+        files[name], tensors = _base_files(base, name)
+        _check_trained(trained[part], tensors, str(file))
+    if not any(name.endswith(" A") for name in trained["Diffuser"]):
+        bad_value(str(file), "a checkpoint of Marigold V2 with a LoRA (Diffuser.*.lora_A.*)", "one without")
+    for part, name in FOLDERS.items():
+        (folder / name).mkdir(parents=True)
+        for copied in ("config.json", INDEX):
+            if (base / name / copied).is_file():
+                shutil.copyfile(base / name / copied, folder / name / copied)
+        for source in files[name]:
+            whole = {key: merged(key, v, trained[part]) for key, v in load_file(source).items()}
+            _save_weights(whole, folder / name / source.name)
+    component = _fixed_prompt(prompt)
+    component.to(prompt.dtype if prompt.is_floating_point() else torch.float32)
+    component.save_pretrained(folder / "prompt")
+    FlowMatchEulerDiscreteScheduler().save_pretrained(folder / "scheduler")
+    index = INDEX_OF_PRIOR | {"prediction_type": space}
+    (folder / "model_index.json").write_text(json.dumps(index, indent=2), encoding="utf-8")
+    _write_card(
+        folder,
+        "apache-2.0",
+        "Marigold V2 (huawei-bayerlab/marigold-v2-0) on Qwen-Image-Edit-2509 (Qwen), both Apache-2.0, "
+        "converted by `geodiff convert marigold-v2`.",
+    )

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, DemoPair, read_demo_pair
-from geodiff_plugin.cli.depth import estimate_and_write
+from geodiff_plugin.cli.depth import estimate_and_write, load_guided_prior
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.outputs import single_map, summary_line
 from geodiff_plugin.cli.terminal import StopWatch, new_table, say, show
@@ -25,9 +25,7 @@ from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
-from geodiff_plugin.priors import load_prior
 from geodiff_plugin.runtime.machine import PeakMemory, pick_device, timed
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 CELL_WIDTH = 360
 #: Name in the table -> gradient of the guidance, ``None`` for the plain pipeline.
@@ -51,10 +49,8 @@ def run_demo(options: DepthOptions, out: OutFolder) -> None:
     aligned_m = align(single_map(plain.prediction), pair.depth_m, pair.valid, pipe.config.prediction_type)
     guided_m = single_map(job.output.prediction)
     table = new_table(("", "AbsRel", "delta1", "RMSE, m"))
-    for name, depth_m in (
-        ("prior, aligned by an oracle", aligned_m),
-        ("guided, metric as it comes", guided_m),
-    ):
+    rows = {"prior, aligned by an oracle": aligned_m, "guided, metric as it comes": guided_m}
+    for name, depth_m in rows.items():
         scores = evaluate_depth(depth_m, pair.depth_m, pair.valid)
         table.add_row(name, *(f"{scores[metric]:.3f}" for metric in ("abs_rel", "delta1", "rmse")))
     show(table)
@@ -69,13 +65,11 @@ def run_demo(options: DepthOptions, out: OutFolder) -> None:
 def measure(gradient: str | None, device_name: str, repeats: int = 2, **knobs: Any) -> tuple[float, int]:
     """Seconds of one call of the bundled prior on the demo pair, and the most bytes that it took.
 
-    Plain and guided calls run the same number of steps. The first call of a process tells its memory, since
-    what is freed later stays with the allocator; the fastest of ``repeats`` more, if any, tells the seconds.
+    The first call of a process tells its memory, since what is freed later stays with the allocator; the
+    fastest of ``repeats`` more, if any, tells the seconds.
     """
     device, pair = torch.device(device_name), read_demo_pair()
-    pipe = load_prior("bundled", device=device)
-    pipe.set_progress_bar_config(disable=True)
-    enable_geometry_guidance(pipe)
+    pipe = load_guided_prior("bundled", device)
     cameras = (pair.rig.K_left, pair.rig.K_right), pair.rig.E
     guidance = GeometryGuidance(pair.right, *cameras, gradient=gradient or "denoised", **knobs)
     options: dict[str, Any] = {"num_inference_steps": guidance.denoising_steps(None, 1)}

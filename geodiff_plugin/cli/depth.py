@@ -35,34 +35,36 @@ from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.types import MetricDepthOutput
 
 
-def load_guided_prior(options: DepthOptions, device: torch.device) -> Any:
+def load_guided_prior(
+    name: str,
+    device: torch.device,
+    space: str | None = None,
+    dtype: str = "float32",
+    options: Sequence[str] = (),
+    quiet: bool = True,
+) -> Any:
     """The prior of ``--prior``, with guidance enabled and no progress bars but that of a download.
 
-    Which it is and its licence are said on stderr, unless ``--quiet``.
+    Which it is and its licence are said on stderr, unless ``quiet``; ``options`` are those of its call.
     """
-    name = options.prior
     on_disk = name == "bundled" or os.path.isdir(name) or os.path.isdir(name.partition(":")[2])
-    with no_bars() if on_disk or options.quiet else nullcontext():
+    with no_bars() if on_disk or quiet else nullcontext():
         prior = find_prior(name)
-        if not options.quiet:
+        if not quiet:
             say(f"prior: {name} ({prior.key}; {prior.licence})")
-        pipe = prior.load(device, getattr(torch, options.dtype), options.space)
+        pipe = prior.load(device, getattr(torch, dtype), space)
     taken = pipe.call_options() if isinstance(pipe, DepthDiffusionPipeline) else []
-    for entry in options.option:
+    for entry in options:
         if (option := entry.partition("=")[0]) not in taken:
             expected = f"one that {prior.key} takes ({', '.join(taken) or 'none'})"
             bad_value("--option", expected, repr(option))
     pipe.set_progress_bar_config(disable=True)
-    enable_geometry_guidance(pipe)
-    return pipe
+    return enable_geometry_guidance(pipe)
 
 
 @dataclass(eq=False)
 class Job:
-    """A pair on its way from its files to its folder, and what the stages have made of it so far.
-
-    ``entries`` are those of the report that only the caller knows.
-    """
+    """A pair on its way to its folder; ``entries`` of its report are those that only the caller knows."""
 
     options: DepthOptions
     folder: OutFolder
@@ -82,7 +84,7 @@ class Job:
     def read(self, frames: Sequence[np.ndarray] | None = None, names: tuple[str, str] | None = None) -> None:
         """Read the views and the cameras, and see that they fit; arguments as for ``read_inputs``."""
         with self.stage("calibration"):
-            self.inputs = read_inputs(self.options, self.options.config(), frames, names)
+            self.inputs = read_inputs(self.options, frames, names)
         # Before the work that it would lose.
         if "colmap" in self.options.export and not self.inputs.undistorted:
             check_colmap_names(told_apart(self.options.photographs().values()))
@@ -129,10 +131,7 @@ def _text(report: dict[str, Any]) -> str:
 def estimate_and_write(
     options: DepthOptions, folder: OutFolder, watch: StopWatch
 ) -> tuple[Any, Job, dict[str, Any]]:
-    """Everything of ``geodiff depth`` but its answer on stdout: the pipeline, the job, the report.
-
-    ``start_pair`` has seen the options and given the folder, which is held; ``watch`` has the stages so far.
-    """
+    """Everything of ``geodiff depth`` on what ``start_pair`` gave but its answer: pipeline, job, report."""
     job = Job(options, folder, watch)
     with collected_warnings():
         device = pick_device(options.device)
@@ -140,7 +139,8 @@ def estimate_and_write(
         for sentence in () if options.quiet else job.inputs.guidance.assumed:
             say(f"assumed: {sentence}")
         with watch.stage("load"):
-            pipe = load_guided_prior(options, device)
+            how = (options.space, options.dtype, options.option, options.quiet)
+            pipe = load_guided_prior(options.prior, device, *how)
         job.guide(pipe, progress=not options.quiet)
         return pipe, job, job.write(pipe)
 

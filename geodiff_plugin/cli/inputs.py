@@ -37,16 +37,12 @@ from geodiff_plugin.guidance.guidance import GeometryGuidance, assume_same_centr
 from geodiff_plugin.types import Distortion, Rig
 
 Size = tuple[int, int]
-Lenses = tuple[Distortion | None, ...]
-"""One entry a photograph, the left one first; ``None`` for a pinhole camera."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """The views, ready to be guided by.
+    """The left view ``(H, W, 3)`` in [0, 1], the cameras of both, and the guidance, with all other views.
 
-    ``left`` is ``(H, W, 3)`` float32 in [0, 1], EXIF orientation applied; ``rig`` the cameras of both views
-    in pixels of these images, the left one's twice without a right one; ``guidance`` holds all other views;
     ``undistorted`` says whether lens distortion was taken out; ``prior_map`` is ``(h, w)``, NaN unknown.
     """
 
@@ -59,16 +55,14 @@ class Inputs:
 
 def read_inputs(
     options: DepthOptions,
-    config: GuidanceConfig,
     frames: Sequence[np.ndarray] | None = None,
     names: tuple[str, str] | None = None,
 ) -> Inputs:
-    """Read the images and the cameras, and see that they fit each other.
+    """Read images and cameras of checked options, and see that they fit each other.
 
-    The checks of ``cli.options`` have seen the options. Views that are no files of their own are given as
-    ``frames``, left and right, ``(H, W, 3)`` float32 in [0, 1].
+    Views that are no files are given as ``frames``, left and right, ``(H, W, 3)`` float32 in [0, 1].
     """
-    views = options.photographs()
+    views, config = options.photographs(), options.config()
     images = list(frames or map(_read_view, views.values(), views))
     sizes = [(image.shape[1], image.shape[0]) for image in images]
     way, rig, poses = options.cameras_way(), None, []
@@ -85,48 +79,33 @@ def read_inputs(
         poses += [check_pose(read_matrix(path, "--view-E"), f"--view-E {path}") for path in options.view_e]
     lenses = lenses_of(options, rig)
     images = [pinhole(*each, config) for each in zip(images, Ks, lenses, strict=False)]
-    known: dict[str, Any] = {"points": _read_known(options, Ks[0], lenses[0], sizes[0], rig)}
-    known |= {"points_confidence": None, "cropped": options.cropped}
+    known: dict[str, Any] = {"cropped": options.cropped}
+    known["points"] = _read_known(options, Ks[0], lenses[0], sizes[0], rig)
     if options.points_confidence is not None:
-        _refuse_lens(lenses[0], "--points-confidence", "Give the points of an image without it, with theirs.")
         known["points_confidence"] = read_confidence(options.points_confidence, "--points-confidence")
     if rig is None:
-        guidance = GeometryGuidance.from_photographs(
-            images,
-            K=Ks,
-            baseline_m=options.baseline,
-            known_length=_known_length(options.known_length, Ks[0], lenses[0]),
-            **known,
-            config=config,
-        )
+        lengths = {"baseline_m": options.baseline, "known_length": _known_length(options, Ks[0], lenses[0])}
+        guidance = GeometryGuidance.from_photographs(images, K=Ks, **lengths, **known, config=config)
         rig = replace(guidance.rigs[0], size_left=sizes[0], size_right=sizes[1], source="estimated")
     elif len(images) == 1:
         if not options.cropped:
             check_intrinsics_fit(rig.K_left, *sizes[0], "K", "LEFT")
         guidance = GeometryGuidance(None, rig.K_left, **known, config=config)
     else:
-        lengths = {"unit": rig.unit, "measured_baseline": rig.measured}
+        known |= {"unit": rig.unit, "measured_baseline": rig.measured}
         posed = list(zip(images, Ks, poses, strict=True))
-        guidance = GeometryGuidance.from_views(posed, **known, **lengths, config=config)
+        guidance = GeometryGuidance.from_views(posed, **known, config=config)
     right_given = options.k_right is not None or options.cx_right is not None
     if way in ("parameters", "matrices") and not right_given and not options.estimate_pose:
         assume_same_centre(guidance)
-    prior_map = None
-    if options.prior_map is not None:
-        _refuse_lens(lenses[0], "--prior-map", "Run the other model on undistorted.png, and give that image.")
-        prior_map = read_map(options.prior_map, "--prior-map")
+    prior_map = None if options.prior_map is None else read_map(options.prior_map, "--prior-map")
     return Inputs(images[0], rig, guidance, any(lens is not None for lens in lenses), prior_map)
-
-
-def _refuse_lens(lens: Distortion | None, name: str, cure: str) -> None:
-    if lens is not None:
-        bad_value(name, "of an image without lens distortion", "a lens with distortion", cure)
 
 
 def _read_view(path: Path, name: str) -> np.ndarray:
     image, notes = read_image(path, name if name in ("LEFT", "RIGHT") else f"--view {path}")
     for note in notes:
-        warn(note, stacklevel=2)
+        warn(note)
     return image
 
 
@@ -161,20 +140,17 @@ def read_rig(
         K_right = K if options.k_right is None else _matrix(options.k_right, "--K-right")
         E = np.eye(4) if options.e is None else check_pose(read_matrix(options.e, "--E"), "--E")
         rig = Rig(K, K_right, E, source=str(options.k), measured=options.e is None)
-    for side, calibrated, size, path in (
-        ("left", rig.size_left, left_size, options.left),
-        ("right", rig.size_right, right_size, options.right),
-    ):
-        cure = "Use the images that it is for, or scale K with them and give --fx --fy --cx --cy."
-        if size is not None:
-            check_calibrated_size(size, calibrated, f"the {side} image {path}", rig.source, cure)
+    cure = "Use the images that it is for, or scale K with them and give --fx --fy --cx --cy."
+    check_calibrated_size(left_size, rig.size_left, f"the left image {options.left}", rig.source, cure)
+    if right_size is not None:
+        check_calibrated_size(
+            right_size, rig.size_right, f"the right image {options.right}", rig.source, cure
+        )
     return replace(rig, size_left=left_size, size_right=right_size)
 
 
 def _matrix(path: Path, option: str) -> np.ndarray:
-    """K out of a file, which is named where an option is given several times."""
-    named = f"{option} {path}" if option.startswith("--view") else option
-    return check_intrinsics(read_matrix(path, option), named)
+    return check_intrinsics(read_matrix(path, option), f"{option} {path}" if "view" in option else option)
 
 
 def _intrinsics(options: DepthOptions, way: str, path: Path, i: int, size: Size) -> np.ndarray:
@@ -195,17 +171,15 @@ def _intrinsics(options: DepthOptions, way: str, path: Path, i: int, size: Size)
     return K
 
 
-def _known_length(
-    text: str | None, K: np.ndarray, lens: Distortion | None
-) -> tuple[float, float, float, float, float] | None:
+def _known_length(options: DepthOptions, K: np.ndarray, lens: Distortion | None) -> tuple[float, ...] | None:
     """``X1,Y1,X2,Y2,METRES`` as typed, its ends where the image without lens distortion has them."""
-    if text is None:
+    if options.known_length is None:
         return None
     try:
-        x1, y1, x2, y2, metres = (float(part) for part in text.split(","))
+        x1, y1, x2, y2, metres = (float(part) for part in options.known_length.split(","))
     except ValueError:  # not numbers, or not five of them
         cure = "Two pixels of LEFT and the distance of the two places, such as 100,200,400,210,1.5."
-        bad_value("--known-length", "X1,Y1,X2,Y2,METRES", repr(text), cure)
+        bad_value("--known-length", "X1,Y1,X2,Y2,METRES", repr(options.known_length), cure)
     if lens is not None:
         (x1, y1), (x2, y2) = undistorted_pixels(np.array([[x1, y1], [x2, y2]]), K, lens).tolist()
     return x1, y1, x2, y2, metres
@@ -214,13 +188,11 @@ def _known_length(
 def _read_known(
     options: DepthOptions, K: np.ndarray, lens: Distortion | None, size: Size, rig: Rig | None = None
 ) -> np.ndarray | None:
-    """The depths of ``--points`` or ``--disparity`` as the left image without lens distortion has them.
+    """The depths of ``--points`` or ``--disparity``, a map ``(H, W)`` in metres or points ``(N, 3)``.
 
-    That is a map ``(H, W)`` float32 metres, 0 where unknown, or points ``(N, 3)``, which a map becomes behind
-    a lens with distortion: its pixels are those of the image as it was taken.
+    A map becomes points behind a lens with distortion: its pixels are those of the image as it was taken.
     """
     if options.disparity is not None:
-        _refuse_lens(lens, "--disparity", "Rectify the images.")
         if rig is None:
             bad_value("--disparity", "of a rectified rig with a calibration", "--estimate-pose")
         return depth_of_disparity(options.disparity, rig, size, "--disparity")
@@ -240,22 +212,18 @@ def _read_known(
 def pinhole(
     image_01: np.ndarray, K: np.ndarray, lens: Distortion | None, config: GuidanceConfig
 ) -> np.ndarray:
-    """The image ``(H, W, 3)`` as a pinhole camera would have taken it; as it is behind a lens that is one.
-
-    Photographs are cleaned first, as ``config`` says: once an image is resampled, the blocks of its
-    compression are no longer found.
-    """
+    """The image ``(H, W, 3)`` as a pinhole camera would have taken it."""
     if lens is None:
         return image_01
+    # Before it is resampled: after it the blocks of its compression are no longer found.
     ready = cleaned(torch.from_numpy(image_01).permute(2, 0, 1), config)
     return undistorted(ready.permute(1, 2, 0).contiguous().numpy(), K, lens)
 
 
-def lenses_of(options: DepthOptions, rig: Rig | None = None) -> Lenses:
+def lenses_of(options: DepthOptions, rig: Rig | None = None) -> tuple[Distortion | None, ...]:
     """Distortion of every photograph's lens, the left one first; ``None`` for a lens without distortion.
 
-    Options take precedence over the calibration. A further view without ``--view-distortion`` has the left
-    one's lens, as it has its K.
+    A further view without ``--view-distortion`` has the left one's lens, as it has its K.
     """
     typed = [distortion_from_text(text) for text in options.distortion]
     if len(typed) > 2:
@@ -269,5 +237,9 @@ def lenses_of(options: DepthOptions, rig: Rig | None = None) -> Lenses:
     if options.view_k and not further and any(is_distorted(lens) for lens in pair):
         cure = "A view with a K of its own has a lens of its own: 0,0,0,0 says that it is straight."
         bad_value("--view-distortion", "given for each --view", "none", cure)
-    lenses: Lenses = (*pair, *further) if further else (*pair, *(pair[0] for _ in options.view))
+    if is_distorted(pair[0]):
+        cure = "Rectify the images, or give what belongs to one without it (undistorted.png of a first run)."
+        names = ("points_confidence", "disparity", "prior_map")
+        options.refuse(names, "of an image without lens distortion", "a lens with distortion", cure)
+    lenses = (*pair, *(further or [pair[0]] * len(options.view)))
     return tuple(lens if is_distorted(lens) else None for lens in lenses)

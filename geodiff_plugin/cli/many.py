@@ -20,7 +20,7 @@ from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.cli.depth import Job, load_guided_prior
 from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, check_files, out_folder_of
 from geodiff_plugin.cli.outputs import read_report
-from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, options_of, start_many, with_right
+from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, options_of, start_many
 from geodiff_plugin.cli.terminal import collected_warnings, new_table, say, show
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import atomic_path, reason_of, write_text
@@ -75,11 +75,8 @@ def _ends_run_on_full_disk() -> Iterator[None]:
 class Stages:
     """The stages of a pair, each called in a thread of its own.
 
-    Args:
-        options: of the run.
-        device: where the prior runs.
-        pipe: the prior where it is loaded; otherwise it is loaded when the first pair has been read.
-        among: stages that compute at the same time and share the cores.
+    A ``pipe`` that is not given is loaded when the first pair has been read; ``among`` stages compute at the
+    same time and share the cores.
     """
 
     def __init__(self, options: DepthOptions, device: torch.device, pipe: Any = None, among: int = 2) -> None:
@@ -95,7 +92,6 @@ class Stages:
         """Look at the files, take the folder, decode the views."""
         ref: PairRef = item.payload
         options = options_of(ref, self._options)
-        with_right(ref, options).check_all()
         check_files(options, photographs=ref.frame is None)
         held = self._folders[item.key] = ExitStack()
         with _ends_run_on_full_disk():
@@ -107,10 +103,8 @@ class Stages:
 
     def _frames(self, ref: PairRef, frame: int) -> Sequence[np.ndarray]:
         for path in {ref.left, ref.right or ref.left} - set(self._videos):
-            if is_bag(path):
-                reader: Any = BagReader(path, self._options.bag_topics(), self._options.tolerance)
-            else:
-                reader = VideoReader(path)
+            bag = (self._options.bag_topics(), self._options.tolerance) if is_bag(path) else None
+            reader: Any = VideoReader(path) if bag is None else BagReader(path, *bag)
             self._videos[path] = self._open.enter_context(reader)
         left = self._videos[ref.left].read(frame)
         return both_halves(left, "LEFT") if ref.right is None else (left, self._videos[ref.right].read(frame))
@@ -118,17 +112,15 @@ class Stages:
     def evidence(self, job: Job) -> Job:
         """What the views say by themselves, into a store of the pair's own, where the call finds it."""
         if self._pipe is None:
+            options = self._options
+            how = (options.space, options.dtype, options.option, options.quiet)
             try:
-                self._pipe = load_guided_prior(self._options, self._device)
+                self._pipe = load_guided_prior(options.prior, self._device, *how)
             except Exception as error:
                 raise _EndsRun from error
         device, guidance = self._pipe._execution_device, job.inputs.guidance
-        with (
-            job.stage("evidence"),
-            WithinCores(self._among),
-            torch.no_grad(),
-            torch.autocast(device.type, enabled=False),
-        ):
+        plain = torch.autocast(device.type, enabled=False)
+        with job.stage("evidence"), WithinCores(self._among), torch.no_grad(), plain:
             guidance.evidence_store = EvidenceStore(1, copies=False)
             guidance.prepare(left_images(job.inputs.left).to(device))
         return job
@@ -162,17 +154,16 @@ def _digests(options: DepthOptions) -> dict[str, str]:
 def finished_row(options: DepthOptions) -> Row | None:
     """The row of a pair that an earlier run has finished; ``None`` where it is still to be done.
 
-    The report is written last and names every file, so a folder that holds all of them is whole. One that
-    was made with other options, or from files whose content has changed since, is an error.
+    A result of other options, or of files whose content has changed since, is an error.
     """
     assert options.out is not None
     report = read_report(options.out)
     try:
         made, row = report["arguments"], _row(report)
-        whole = all((options.out / name).stat().st_size > 0 for name in report["files"]["names"])
+        # The report is written last and names every file, so a folder that holds all of them is whole.
+        if not all((options.out / name).stat().st_size > 0 for name in report["files"]["names"]):
+            return None
     except (OSError, KeyError, TypeError):
-        return None
-    if not whole:
         return None
     wanted, of_fields = options.as_json(), DepthOptions.__dataclass_fields__
     others = [n for n in wanted if n not in NOT_OF_THE_RESULT and wanted[n] != made.get(n, wanted[n])]
@@ -219,35 +210,25 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
     assert options.out is not None
     _refuse_one_length(options, refs)
     device, _ = pick_device(options.device), options.config()
-
-    def finished(ref: PairRef) -> Row | None:
-        return None if options.overwrite else finished_row(options_of(ref, options))
-
-    rows = {ref.name: finished(ref) for ref in refs}
-    there = {name: row for name, row in rows.items() if row is not None}
-    journal = Journal(options.out / JOURNAL)
+    journal, there = Journal(options.out / JOURNAL), dict[str, Row]()
     items = [Item(r.name, r, words=(str(r.left), str(r.right), str(options.out / r.name))) for r in refs]
     for item in items:
-        if item.key in there and journal.get(item) is None:
-            journal.put(item, there[item.key])
-    runner = Runner(
-        items,
-        journal,
-        noun="pair",
-        survives=(Exception,),
-        # Looked at again: another process may have finished it.
-        whole=lambda item, _: finished(item.payload) is not None,
-        progress=not options.quiet,
-    )
+        row = None if options.overwrite else finished_row(options_of(item.payload, options))
+        if row is None:
+            journal.forget(item)
+            continue
+        there[item.key] = row
+        if journal.get(item) is None:
+            journal.put(item, row)
+    runner = Runner(items, journal, noun="pair", survives=(Exception,), progress=not options.quiet)
     process = runner.process
     if device.type == "cuda" and device.index is None:
         device = torch.device("cuda", process.local % torch.cuda.device_count())
     stages = Stages(options if process.index == 0 else replace(options, quiet=True), device)
+    steps = (stages.read, stages.evidence, stages.guide, stages.write)
     try:
         with collected_warnings(), _ends_run_on_full_disk():
-            records = runner.run(
-                stages.read, stages.evidence, stages.guide, stages.write, release=stages.release
-            )
+            records = runner.run(*steps, release=stages.release)
     except _EndsRun as ended:
         assert ended.__cause__ is not None
         raise ended.__cause__ from None
@@ -266,10 +247,7 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
 
 
 def _final(record: Row, there: Row | None, options: DepthOptions) -> Row:
-    """A row of the table from a record of the journal, or from the report that an earlier run left.
-
-    With ``--strict`` what is not trusted has failed.
-    """
+    """A row of the table from a record of the journal, or from the report that an earlier run left."""
     record = record | (there or {})
     row = {name: record.get(name) for name in COLUMNS} | {"pair": record["key"]}
     if record.get("status") == BROKEN:
@@ -278,7 +256,7 @@ def _final(record: Row, there: Row | None, options: DepthOptions) -> Row:
         return row | {"result": "there" if there else "done"}
     assert options.out is not None
     reason = f"The depth in {options.out / record['key']} is {record['verdict']}: {record['reasons']}"
-    say(f"geodiff: {record['key']}: {reason}")
+    say(f"geodiff: {record['key']}: {reason}")  # --strict: it has failed
     return dict.fromkeys(COLUMNS) | {"pair": record["key"], "result": "failed", "message": reason}
 
 
@@ -309,11 +287,7 @@ def _answer(rows: Sequence[Row], options: DepthOptions, out: Path) -> None:
 
 
 def run_bag(options: DepthOptions) -> bool:
-    """Depth of every pair of a bag as a bag; whether one of them failed.
-
-    The results lie in a folder beside ``--out``, named ``NAME-frames``, from which the same command goes on
-    after it was interrupted; the bag is written when all pairs are done, without those that failed.
-    """
+    """Depth of every pair of a bag as a bag, by way of the folder ``NAME-frames``; whether one failed."""
     out, topics = options.out or Path("depth.mcap"), options.bag_topics()
     if out.suffix not in BAG_SUFFIXES or out.is_dir():
         bad_value("--out", f"a file that ends in {' or '.join(BAG_SUFFIXES)}, as LEFT is a bag", out)

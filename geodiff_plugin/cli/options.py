@@ -1,4 +1,4 @@
-"""``geodiff depth``: its options, and every check of them that needs neither torch nor a decoded image."""
+"""Options of ``geodiff depth`` and ``geodiff capture``, and their checks that need no torch."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from functools import partial
 from pathlib import Path
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.capture import NEIGHBOURS, POINTS
 from geodiff_plugin.formats.files import check_file, open_image
 from geodiff_plugin.formats.out import OutFolder
-from geodiff_plugin.options import CAMERAS, OUTPUT, RunOptions, declare, flag_of
+from geodiff_plugin.options import CAMERAS, OUTPUT, PriorOptions, RunOptions, check_options, declare, flag_of
 
 #: What is read of a COLMAP model, the one kind of calibration that is a folder.
 MODEL_FILES = ("cameras.txt", "images.txt")
@@ -180,6 +181,7 @@ class DepthOptions(RunOptions):
         known = "Poses are given or estimated. For K alone give --K, or --fx --fy --cx --cy."
         second = "given with RIGHT", "no RIGHT", "It belongs to a second view."
         of_file = "given with --calib only", "no --calib", "It chooses among the cameras of a file."
+        of_depths = "given with --points or --disparity", "neither", ""
         return [
             (paper, "points disparity", *default, "Algorithm 1 has no points."),
             (paper, "view", *default, "Algorithm 1 has two views."),
@@ -188,13 +190,7 @@ class DepthOptions(RunOptions):
             (not self.calib, "cameras", *of_file),
             (no_points, "points_scale points_calib", "given with --points", "no --points", ""),
             (not no_points, "disparity", "given in place of --points", "both", ""),
-            (
-                no_points and no_disparity,
-                "points_confidence",
-                "given with --points or --disparity",
-                "neither",
-                "",
-            ),
+            (no_points and no_disparity, "points_confidence", *of_depths),
             (alone and no_disparity, "baseline cx_right", *second),
             (alone, "e k_right view estimate_pose", *second),
         ]
@@ -203,14 +199,12 @@ class DepthOptions(RunOptions):
         """How the cameras are given, or with ``--estimate-pose`` K: a key of ``WAYS``, or ``"EXIF"``."""
         alone = self.right is None and self.disparity is None
         # --baseline beside --calib gives a file its unit, as COLMAP's models need it.
-        needed: dict[str, tuple[str, ...]] = {}
-        needed["parameters"] = PARAMETERS[: 4 if self.calib or self.estimate_pose or alone else 5]
-        needed["matrices"] = ("k",) if self.estimate_pose or alone else ("k", "e")
-        given = {
-            name
-            for name in itertools.chain(PARAMETERS, *WAYS.values())
-            if getattr(self, name) not in (None, ())
+        needed = {
+            "parameters": PARAMETERS[: 4 if self.calib or self.estimate_pose or alone else 5],
+            "matrices": ("k",) if self.estimate_pose or alone else ("k", "e"),
         }
+        every = itertools.chain(PARAMETERS, *WAYS.values())
+        given = {name for name in every if getattr(self, name) not in (None, ())}
         taken = [way for way, names in WAYS.items() if given & {*names, *needed.get(way, ())}]
         numbers, matrices = (" ".join(map(_flag, needed[way])) for way in ("parameters", "matrices"))
         known = f"--calib FILE, or {numbers}, or {matrices}"
@@ -266,3 +260,65 @@ def start_pair(options: DepthOptions) -> OutFolder:
     options.cameras_way()
     check_files(options)
     return out_folder_of(options)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions(PriorOptions):
+    """The options of ``geodiff capture`` as they were typed."""
+
+    path: Path = declare(
+        MISSING,
+        "COLMAP model, transforms.json (nerfstudio, Polycam, Record3D, instant-ngp) or its folder, "
+        "folder of 7-Scenes, ScanNet or TUM RGB-D, video with --trajectory, or folder of images.",
+        "",
+        metavar="PATH",
+    )
+    out: Path = _output(Path("geodiff-capture"), "Folder for the results, one folder a frame.", "--out", "-o")
+    frames: str | None = declare(
+        None, "Which frames get depth: NAME,NAME by file stem, or FIRST:LAST:STEP; all by default."
+    )
+    neighbours: int = declare(NEIGHBOURS, "Right views of a frame, at most.", low=1, high=32)
+    poses: str = _camera(
+        "refined",
+        "refined: solved together over the capture; given: as they are.",
+        choices=("refined", "given"),
+    )
+    points: str = declare(
+        "tracks",
+        "Known depths: tracks (points of the pose solve), none, model (points of a COLMAP model), depth "
+        "(maps it names).",
+        choices=POINTS,
+    )
+    metres_per_unit: float | None = _camera(
+        None, "Length of one unit of the poses, metres.", above_0="metres"
+    )
+    known_length: str | None = _camera(
+        None, "A distance in the scene, NAME:X1,Y1,X2,Y2,METRES by pixels of a frame."
+    )
+    distance: str | None = _camera(None, "Distance of two cameras, NAME,NAME,METRES.")
+    k: Path | None = _camera(None, "3x3 intrinsics, text or .npy.", "--K")
+    fov: float | None = _camera(None, "Horizontal field of view, degrees.")
+    trajectory: Path | None = _camera(
+        None, "Of a video: lines of seconds tx ty tz qx qy qz qw, camera-to-world."
+    )
+    prior_map: Path | None = declare(
+        None, "Folder of depth maps of another model, NAME.npy or another map a frame, in place of a prior."
+    )
+    processes: int | None = declare(
+        None, "Processes that share the frames; by default one a core.", low=1, high=1024
+    )
+    export: tuple[str, ...] = _output(
+        (),
+        "colmap: a dense workspace; mesh: by TSDF (extra mesh); repeatable.",
+        choices=("colmap", "mesh"),
+    )
+    overwrite: bool = _output(False, "Write into a folder that holds files; do finished frames anew.")
+    quiet: bool = _output(False, "No progress bar.", "--quiet", "-q")
+    json: bool = _output(False, "Print the report instead of a summary.")
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        ways = ("metres_per_unit", "known_length", "distance")
+        if sum(getattr(self, way) is not None for way in ways) > 1:
+            several = "more of --metres-per-unit, --known-length, --distance"
+            bad_value("the scale", "given in one way", several)

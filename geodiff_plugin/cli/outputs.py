@@ -47,10 +47,7 @@ def single_map(value: Any) -> np.ndarray:
 
 
 def depth_summary(depth_m: np.ndarray, visible: np.ndarray | None) -> dict[str, Any]:
-    """Near, far, median of ``(H, W)`` metres over valid pixels; shares and counts over all.
-
-    ``visible`` is ``None`` without a right view.
-    """
+    """Near, far, median of ``(H, W)`` metres over valid pixels; shares and counts over all."""
     valid = np.isfinite(depth_m) & (depth_m > 0)
     kept = depth_m[valid] if valid.any() else np.array([math.nan])
     return {
@@ -79,10 +76,7 @@ def plain(value: Any) -> Any:
 
 
 def used_poses(output: MetricDepthOutput, guidance: GeometryGuidance) -> tuple[np.ndarray, ...]:
-    """``(4, 4)`` poses of the further views of one image, in the left camera's frame and the output's unit.
-
-    Where they were refined these are the refined ones, which the depth fits.
-    """
+    """``(4, 4)`` poses of the further views in the output's unit; the refined ones, which the depth fits."""
     if output.poses and output.poses[0].status == "refined":
         return output.poses[0].E
     return tuple(_rescaled(rig.E, output) for rig in guidance.rigs)
@@ -181,10 +175,7 @@ def summary_line(report: dict[str, Any], where: str) -> str:
 def write_maps(
     folder: Path, output: MetricDepthOutput, left: np.ndarray, min_confidence: float = 0.0
 ) -> dict[str, Any]:
-    """Write every file but exports and the report of one image, at its resolution; counts for the report.
-
-    The image ``left (H, W, 3)`` in [0, 1] colours the cloud, which pixels of less confidence are not part of.
-    """
+    """Write every file but exports and the report of the image ``left (H, W, 3)``; counts for the report."""
     depth_m, K = single_map(output.prediction).astype(np.float32), np.asarray(output.K)[0]
     write_depth_npy(folder / "depth.npy", depth_m)
     zeros = write_depth_mm(folder / "depth_mm.png", depth_m)
@@ -239,14 +230,9 @@ def cloud_of(output: MetricDepthOutput, left: np.ndarray, least_confidence: floa
 
 
 def write_exports(folder: Path, output: MetricDepthOutput, inputs: Inputs, options: DepthOptions) -> None:
-    """Write what ``--export`` asks for, into a folder with the maps.
-
-    The images of a COLMAP model are the photographs, or written here where lens distortion was taken out.
-    """
-    cloud, cameras = (
-        cloud_of(output, inputs.left, options.min_confidence),
-        cameras_of(output, inputs.guidance),
-    )
+    """Write what ``--export`` asks for, and images of a COLMAP model that were undistorted."""
+    cloud = cloud_of(output, inputs.left, options.min_confidence)
+    cameras = cameras_of(output, inputs.guidance)
     if "glb" in options.export:
         write_glb(folder / "cloud.glb", cloud, cameras)
     if "colmap" in options.export:

@@ -1,7 +1,4 @@
-"""Which pairs a run over many consists of: from two folders, a list, or the video of a rig.
-
-Nothing here imports torch: what is wrong with a list is said at once.
-"""
+"""Which pairs a run over many consists of: from two folders, a list, or a video; imports no torch."""
 
 from __future__ import annotations
 
@@ -9,7 +6,6 @@ import csv
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,8 +28,7 @@ LISTS = (".csv", ".tsv", ".txt")
 class PairRef:
     """One pair of many, in a folder ``name`` below ``--out`` that no other pair has.
 
-    ``left`` and ``right`` are images, or the videos that they are a frame of, ``frame`` counts from 0; where
-    a video has both views side by side, ``right`` is ``None``. ``calib`` is ``None`` for that of the run.
+    ``left`` and ``right`` are images, or the videos that they are a frame of; one with both views is alone.
     """
 
     name: str
@@ -48,11 +43,6 @@ def is_many(left: Path) -> bool:
     return os.path.isdir(left) or left.suffix.lower() in LISTS or is_video(left)
 
 
-def with_right(ref: PairRef, options: DepthOptions) -> DepthOptions:
-    """Options of one of many pairs for checks, to which one video of both views is each view's."""
-    return options if ref.frame is None or ref.right is not None else replace(options, right=ref.left)
-
-
 def start_many(options: DepthOptions) -> list[PairRef]:
     """Find the pairs of a run over many, and make all checks that need neither images nor torch."""
     names = ("points", "disparity", "view", "known_length")
@@ -65,27 +55,19 @@ def start_many(options: DepthOptions) -> list[PairRef]:
         if "colmap" in options.export:
             cure = "A model names image files: extract the frames, and give their folders."
             bad_value("--export colmap", "left out with a video", "given", cure)
-    first = with_right(refs[0], each[0])
+    first = replace(each[0], right=refs[0].right or refs[0].left)  # one video may have both views
     first.check_all()
     if options.estimate_pose or all(ref.calib is None for ref in refs):
         first.cameras_way()
     check_files(replace(options, prior_map=each[0].prior_map), photographs=False)
-    _check_summary(options)
-    return refs
-
-
-def _check_summary(options: DepthOptions) -> None:
-    """See that the table of the run replaces no file of the user's, and is no result of one pair."""
     assert options.out is not None
-    folder, path = check_out(options.out), options.out / SUMMARY
-    if (folder / "report.json").exists():
-        got = f"{options.out}, which holds the result of one pair"
-        bad_value("--out", "a folder for the folders of many pairs", got, "Name another.")
+    path = check_out(options.out) / SUMMARY
     ours = path.is_file() and path.read_bytes().startswith(",".join(COLUMNS).encode())
     if os.path.lexists(path) and not ours:
         cure = f"Name another --out, or move that {SUMMARY}: a table of the results takes its place."
-        got = f"{path}, which is not the table of an earlier run"
+        got = f"{options.out / SUMMARY}, which is not the table of an earlier run"
         bad_value("--out", f"a folder whose {SUMMARY} may be replaced", got, cure)
+    return refs
 
 
 def find_pairs(options: DepthOptions) -> list[PairRef]:
@@ -93,10 +75,12 @@ def find_pairs(options: DepthOptions) -> list[PairRef]:
     left, right = options.left, options.right
     if is_bag(left):
         return _frames(len(list_pairs(left, options.bag_topics(), options.tolerance)), left, None)
-    tell = (lambda _: None) if options.quiet else say
-    if os.path.isdir(left):
-        return _of_folders(left, right, tell)
-    return _of_videos(left, right, tell) if is_video(left) else _of_list(left, right)
+    if not os.path.isdir(left) and not is_video(left):
+        return _of_list(left, right)
+    refs, assumed = (_of_folders if os.path.isdir(left) else _of_videos)(left, right)
+    if assumed and not options.quiet:
+        say(f"assumed: {assumed}")
+    return refs
 
 
 def options_of(ref: PairRef, options: DepthOptions) -> DepthOptions:
@@ -125,8 +109,8 @@ def _natural(path: Path) -> tuple[list[str | int], str]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
 
-def _of_folders(left: Path, right: Path | None, tell: Callable[[str], None]) -> list[PairRef]:
-    """The pairs; which views belong together is told where it was assumed."""
+def _of_folders(left: Path, right: Path | None) -> tuple[list[PairRef], str]:
+    """The pairs, and what was assumed of them."""
     if right is None or not os.path.isdir(right):
         got = "nothing" if right is None else right
         bad_value("RIGHT", "a folder where LEFT is one", got, "Or let LEFT be an image, or a list of pairs.")
@@ -142,26 +126,25 @@ def _of_folders(left: Path, right: Path | None, tell: Callable[[str], None]) -> 
     if not {path.stem for path in lefts} & set(of_stem) and len(lefts) == len(rights):
         pairs = list(zip(lefts, rights, strict=True))  # im0_L.png, im0_R.png
         first, last = (f"{a.name} with {b.name}" for a, b in (pairs[0], pairs[-1]))
-        tell(f"assumed: The two folders share no name, so images are paired in order: {first} to {last}.")
-        return [PairRef(a.stem, a, b) for a, b in pairs]
+        assumed = f"The two folders share no name, so images are paired in order: {first} to {last}."
+        return [PairRef(a.stem, a, b) for a, b in pairs], assumed
     if alone := {path.stem for path in lefts} ^ set(of_stem):
         cure = "Remove it, or write a list of pairs: LEFT,RIGHT[,CALIB] a line."
         got = f"{len(lefts)} left and {len(rights)} right images; {min(alone)} has no partner"
         bad_value("LEFT and RIGHT", "folders of images with the same names, or as many in order", got, cure)
-    return [PairRef(path.stem, path, of_stem[path.stem]) for path in lefts]
+    return [PairRef(path.stem, path, of_stem[path.stem]) for path in lefts], ""
 
 
-def _of_videos(left: Path, right: Path | None, tell: Callable[[str], None]) -> list[PairRef]:
+def _of_videos(left: Path, right: Path | None) -> tuple[list[PairRef], str]:
     frames = count_frames(left, "LEFT")
     if right is None:
-        tell(f"assumed: {left} holds both views side by side; else name both videos.")
-        return _frames(frames, left, None)
+        return _frames(frames, left, None), f"{left} holds both views side by side; else name both videos."
     if not is_video(right):
         bad_value("RIGHT", f"a video too ({', '.join(VIDEOS)}), or left out", right)
     if (others := count_frames(right, "RIGHT")) != frames:
         cure = "Cut them to the same moments first."
         bad_value("RIGHT", f"a video of {frames} frames, as the left one", f"{others} frames", cure)
-    return _frames(frames, left, right)
+    return _frames(frames, left, right), ""
 
 
 def _frames(count: int, left: Path, right: Path | None) -> list[PairRef]:
@@ -190,16 +173,9 @@ def _of_list(path: Path, right: Path | None) -> list[PairRef]:
         rows.append([file.parent / cell for cell in cells])
     if not rows:
         bad_value("LEFT", "a list with a pair a line: LEFT,RIGHT[,CALIB]", f"{path}, which names none")
-    names = _names([row[0] for row in rows])
-    named = zip(names, rows, strict=True)
-    return [PairRef(name, row[0], row[1], row[2] if len(row) > 2 else None) for name, row in named]
-
-
-def _names(lefts: Sequence[Path]) -> list[str]:
-    """A folder name a pair: the left image's, with what tells it apart from others of that name."""
-    counts, names = Counter[str](), list[str]()
-    for name in told_apart(lefts):
+    counts, refs = Counter[str](), list[PairRef]()
+    for name, row in zip(told_apart([row[0] for row in rows]), rows, strict=True):
         stem = Path(name).with_suffix("").as_posix().replace("/", "_")
         counts[stem] += 1  # one left view with several right ones
-        names.append(stem if counts[stem] == 1 else f"{stem}-{counts[stem]}")
-    return names
+        refs.append(PairRef(stem if counts[stem] == 1 else f"{stem}-{counts[stem]}", *row))
+    return refs

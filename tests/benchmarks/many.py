@@ -81,7 +81,7 @@ class ManyPairs:
     def __init__(self, options: DepthOptions) -> None:
         self._options, self._refs = options, start_many(options)
         self._device = pick_device(options.device)
-        self._pipe = load_guided_prior(options, self._device)
+        self._pipe = load_guided_prior(options.prior, self._device)
 
     def seconds(self, most: int, shared: bool) -> tuple[float, float]:
         """Seconds of a clock and of all cores for all pairs.

@@ -75,7 +75,6 @@ FILES: dict[str, Any] = {
     "l/b.png": "",
     "r/b.png": "",
     "texts/a.md": "",
-    "one/report.json": "{}",
     "mine/pairs.csv": "left.png,right.png\n",
     "drive.mcap": b"\0" * 99,
     # other commands

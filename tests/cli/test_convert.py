@@ -11,8 +11,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
-from geodiff_plugin.cli.convert import run_convert
-from geodiff_plugin.cli.converters.marigold_v2 import merged, read_prompt
+from geodiff_plugin.cli.convert import merged, read_prompt, run_convert
 from geodiff_plugin.priors import find_prior, load_prior
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline

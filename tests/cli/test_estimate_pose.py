@@ -187,7 +187,7 @@ def told_to_estimate(pair_files, monkeypatch):
         monkeypatch.setattr(GeometryGuidance, "from_photographs", stop)
         options = DepthOptions(**VIEWS, device="cpu", estimate_pose=True, **FOUR | given)
         with pytest.raises(InterruptedError):
-            read_inputs(options, options.config())
+            read_inputs(options)
         return told
 
     return tell

@@ -41,7 +41,7 @@ def test_nothing_of_the_package_raises_a_plain_error_at_a_user():
 
 
 def test_a_defect_keeps_its_traceback_and_ctrl_c_is_a_line(monkeypatch, geodiff, pair_files):
-    def broken(*_):
+    def broken(*_, **__):
         raise ValueError("a defect")
 
     before = sorted(pair_files.folder.iterdir())

@@ -24,7 +24,7 @@ from transformers import (
 )
 
 from examples.marigold_v2 import tiny_marigold_v2
-from geodiff_plugin.cli.converters.depthfm import unet_config
+from geodiff_plugin.cli.convert import unet_config
 from geodiff_plugin.priors import load_prior
 from geodiff_plugin.priors.components import DirectScheduler, FixedPrompt
 from geodiff_plugin.priors.depthfm import DepthFMPipeline

@@ -16,15 +16,17 @@ from PIL import Image
 from geodiff_plugin import enable_geometry_guidance
 from geodiff_plugin.app import job, launch
 from geodiff_plugin.app.job import Priors, Stopped, options_of, run_job
-from geodiff_plugin.app.measure import distance_m, metres, read_pixel
 from geodiff_plugin.app.results import (
     depth_of,
+    distance_m,
     files_of,
     legend_of_confidence,
     legend_of_depth,
     map_of,
     marked,
     measurement,
+    metres,
+    read_pixel,
     reading,
 )
 from geodiff_plugin.formats import read_calibration, read_image

@@ -14,11 +14,11 @@ import pytest
 pytest.importorskip("pycolmap")
 
 from geodiff_plugin import Capture, InputError
-from geodiff_plugin.capture import run
 from geodiff_plugin.capture.agreement import DepthFrame, agreed
 from geodiff_plugin.capture.capture import choose_neighbours
-from geodiff_plugin.capture.options import CaptureOptions
 from geodiff_plugin.capture.results import fuse, write_map, write_mesh
+from geodiff_plugin.cli import capture as run
+from geodiff_plugin.cli.options import CaptureOptions
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.frames import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
@@ -238,6 +238,7 @@ def model(tmp_path, monkeypatch):
 
     monkeypatch.setattr(run, "_depth", with_unit)
     monkeypatch.setattr(run, "_pipe", lambda options: None)
+    monkeypatch.setattr(run, "write_maps", lambda folder, output, image: {})
     return lambda **options: CaptureOptions(
         path=source, out=tmp_path / "out", frames="2:6:2", quiet=True, processes=1, overwrite=True, **options
     )
@@ -259,21 +260,18 @@ def a_length() -> str:
     ],
     ids=lambda way: next(iter(way), "none"),
 )
-def test_one_length_gives_all_and_without_one_nothing_says_metres(way, model, tmp_path):
-    from geodiff_plugin.cli.capture import _summary
-
-    said: list[str] = []
+def test_one_length_gives_all_and_without_one_nothing_says_metres(way, model, tmp_path, monkeypatch, capsys):
     options = model(**way)
-    report = run.run_capture(options, lambda folder, output, image: {}, said.append)
+    report = run.capture_report(options)
     truth, depth = render(TRUE[4])[1], np.load(tmp_path / "out/f04/depth.npy")
     assert np.median(depth / truth) == pytest.approx(1 if way else 0.5, rel=0.02)
     cloud = (tmp_path / "out/cloud.ply").read_bytes()[:200].decode("latin1")
-    texts = [_summary(report, options.out), cloud, *said]
+    texts = [run.summary(report, options.out), cloud, capsys.readouterr().err]
     assert any(" m " in text or "metres" in text for text in texts) is bool(way)
     assert report["unit"] == json.loads((tmp_path / "out/f04/report.json").read_text())["unit"]
     assert report["unit"] == ("m" if way else None)
-    options = replace(options, overwrite=False)
-    again = run.run_capture(options, lambda *_: pytest.fail("done before"), said.append)
+    monkeypatch.setattr(run, "write_maps", lambda *_: pytest.fail("done before"))
+    again = run.capture_report(replace(options, overwrite=False))
     assert [frame["frame"] for frame in again["frames"]] == ["f02", "f04", "f06"]
     (tmp_path / "out/poses.npz").write_bytes(b"torn")
     assert run.load_solved(tmp_path / "out/poses.npz", "") is None
