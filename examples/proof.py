@@ -24,7 +24,7 @@ from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.metrics import align, evaluate_depth
-from geodiff_plugin.priors import find_adapter, find_prior
+from geodiff_plugin.priors import find_prior, prior_of
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.runtime.machine import PeakMemory, pick_device, timed, versions
 
@@ -129,7 +129,7 @@ def prove(name: str, pairs: list[Pair], device: torch.device, dtype: torch.dtype
         return Proof(name, absent=str(error))
     pipe.set_progress_bar_config(disable=True)
     proof = Proof(name, facts=(recognised.key, recognised.licence, weights_hash(recognised.layout)))
-    space, results = find_adapter(pipe)(pipe).space, {}
+    space, results = prior_of(pipe).space, {}
 
     def call(key: str, pair: Pair, **told: Any) -> float:
         seeded = torch.Generator(device).manual_seed(seed)

@@ -37,7 +37,7 @@ from transformers import CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.algorithm.schedule import count_steps
-from geodiff_plugin.priors import find_adapter
+from geodiff_plugin.priors import prior_of
 from geodiff_plugin.runtime.checks import left_images
 from geodiff_plugin.runtime.estimate import ProcessingGrid
 from geodiff_plugin.runtime.hooks import frozen_weights
@@ -331,7 +331,7 @@ class GeometryEvidenceStep(Block):
         """Prepare the guided run on the same networks."""
         parts = {spec.name: getattr(components, spec.name) for spec in self.components}
         host = MarigoldDepthPipeline(**parts, prediction_type=block_state.prediction_type or "depth")
-        prior = find_adapter(host)(host)
+        prior = prior_of(host)
         knobs = {**(block_state.knobs or {}), "points": block_state.points}
         guidance = GeometryGuidance(block_state.right, block_state.K, block_state.E, **knobs)
         asked = block_state.num_inference_steps

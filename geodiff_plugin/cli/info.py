@@ -11,7 +11,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.bundled import no_bars
 from geodiff_plugin.cli.terminal import print_lines
 from geodiff_plugin.config import knob_lines
-from geodiff_plugin.priors import PRIORS, FoundPrior, find_adapter, find_prior
+from geodiff_plugin.priors import PRIORS, FoundPrior, find_prior, prior_of
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runtime.machine import versions
 
@@ -19,7 +19,7 @@ from geodiff_plugin.runtime.machine import versions
 def _describe(found: FoundPrior, space: str | None) -> list[tuple[str, str]]:
     """What the adapter of a prior found, once its weights are read."""
     pipe = found.load(space=space)
-    adapter = find_adapter(pipe)(pipe)
+    adapter = prior_of(pipe)
     parts = [part for part in pipe.components.values() if isinstance(part, torch.nn.Module)]
     parameters = sum(weight.numel() for part in parts for weight in part.parameters())
     most = "" if adapter.max_steps is None else f", at most {adapter.max_steps}"

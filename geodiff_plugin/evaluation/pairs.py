@@ -221,7 +221,7 @@ def cost_table(records: Sequence[Record]) -> Table:
 
 def _steps_of(prior: str) -> int | None:
     """``STEPS``, or ``None`` for a prior that was trained for fewer: its own number then."""
-    most = getattr(PRIORS[find_prior(prior).key].pipeline_class, "max_steps", None)
+    most = PRIORS[find_prior(prior).key].max_steps
     return STEPS if most is None or most >= STEPS else None
 
 

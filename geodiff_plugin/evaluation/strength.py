@@ -31,7 +31,7 @@ from geodiff_plugin.evaluation.metrics import edge_error, evaluate_depth, filled
 from geodiff_plugin.evaluation.options import STRENGTHS, StrengthOptions, data_of
 from geodiff_plugin.evaluation.scoring import DENSE, in_metres
 from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, method_title, most_of
-from geodiff_plugin.priors import find_adapter
+from geodiff_plugin.priors import prior_of
 from geodiff_plugin.runner import Item, Record
 from geodiff_plugin.runtime.noise_levels import noise_level
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
@@ -148,7 +148,7 @@ class EmulatedPrior(PriorCache):
         size = tuple(side - pad for side, pad in zip(padded.shape[-2:], padding, strict=True))
         small = F.interpolate(relative, size, mode="bilinear", antialias=True)
         small = F.pad(small, (0, padding[1], 0, padding[0]), mode="replicate")
-        self.pipe.unet.code = find_adapter(self.pipe)(self.pipe).encode(small).float()
+        self.pipe.unet.code = prior_of(self.pipe).encode(small).float()
 
 
 def _measure(

@@ -13,42 +13,43 @@ import torch
 from diffusers import DiffusionPipeline
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice
-from geodiff_plugin.priors.base import DepthPrior
-from geodiff_plugin.priors.depthfm import DepthFMPrior
-from geodiff_plugin.priors.depthmaster import DepthMasterPrior
-from geodiff_plugin.priors.geowizard import GeoWizardPrior
+from geodiff_plugin.priors.depthfm import DepthFMPipeline
+from geodiff_plugin.priors.depthmaster import DepthMasterPipeline
+from geodiff_plugin.priors.geowizard import GeoWizardPipeline
 from geodiff_plugin.priors.loading import BUNDLED_FOLDER, Layout, fetch, reading, refuse
-from geodiff_plugin.priors.lotus import LotusPrior
-from geodiff_plugin.priors.map import MAP_LAYOUT, DepthMapPrior
+from geodiff_plugin.priors.lotus import LotusPipeline
+from geodiff_plugin.priors.map import MAP_LAYOUT, DepthMapPipeline
 from geodiff_plugin.priors.marigold import E2EFTPrior, MarigoldPrior
-from geodiff_plugin.priors.marigold_v2 import MarigoldV2Prior
-from geodiff_plugin.priors.ppd import PPDPrior
-from geodiff_plugin.priors.transformers_depth import TransformersDepthPrior
+from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
+from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline, DepthPrior
+from geodiff_plugin.priors.ppd import PPDPipeline
+from geodiff_plugin.priors.transformers_depth import TransformersDepthPipeline
 from geodiff_plugin.scale.space import SPACES
 
-__all__ = ["BUNDLED_FOLDER", "PRIORS", "DepthPrior", "FoundPrior", "find_adapter", "find_prior", "load_prior"]
+__all__ = ["BUNDLED_FOLDER", "PRIORS", "DepthPrior", "FoundPrior", "find_prior", "load_prior", "prior_of"]
 
 #: The first that recognises a folder takes it, so the more particular one stands before the more general.
 PRIORS: dict[str, type[DepthPrior]] = {
-    "marigold-v2": MarigoldV2Prior,
-    "geowizard": GeoWizardPrior,
-    "lotus": LotusPrior,
-    "depthmaster": DepthMasterPrior,
-    "depthfm": DepthFMPrior,
-    "ppd": PPDPrior,
-    "transformers": TransformersDepthPrior,
-    "map": DepthMapPrior,
+    "marigold-v2": MarigoldV2Pipeline,
+    "geowizard": GeoWizardPipeline,
+    "lotus": LotusPipeline,
+    "depthmaster": DepthMasterPipeline,
+    "depthfm": DepthFMPipeline,
+    "ppd": PPDPipeline,
+    "transformers": TransformersDepthPipeline,
+    "map": DepthMapPipeline,
     "e2e-ft": E2EFTPrior,
     "marigold": MarigoldPrior,
 }
 
 
-def find_adapter(pipe: Any) -> type[DepthPrior]:
-    """The class in ``PRIORS`` that understands a live pipeline, or ``DepthPrior``; else a ``TypeError``."""
-    adapters: list[type[DepthPrior]] = [*PRIORS.values(), DepthPrior]
-    for adapter in adapters:
-        if isinstance(pipe, adapter.pipeline_class):
-            return adapter
+def prior_of(pipe: Any) -> DepthPrior:
+    """What guidance asks of a live pipeline: itself, or its adapter in ``PRIORS``; else a ``TypeError``."""
+    if isinstance(pipe, DepthDiffusionPipeline):
+        return pipe
+    for adapter in PRIORS.values():
+        if isinstance(pipe, getattr(adapter, "pipeline_class", ())):
+            return adapter(pipe)  # type: ignore[call-arg]
     expected = f"a pipeline with an adapter ({', '.join(PRIORS)})"
     bad_type("pipe", expected, pipe, "docs/how-to/extending.md shows how to write one.")
 

@@ -11,7 +11,6 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.components import FixedPrompt, SidesOf
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, stretched
@@ -61,6 +60,15 @@ class DepthFMPipeline(DepthDiffusionPipeline):
         modules = {"unet": unet, "vae": vae, "scheduler": scheduler, "prompt": prompt}
         self.register_prior(modules, *defaults, SidesOf(SIDE), noising_step=noising_step)
 
+    @staticmethod
+    def recognises(layout: Layout) -> bool:
+        """Eight channels in, a saved prompt, a scheduler of rectified flow (which alone has a ``shift``)."""
+        return (
+            layout.config("unet").get("in_channels") == 8
+            and bool(layout.config("prompt"))
+            and "shift" in layout.config("scheduler")
+        )
+
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
     ) -> Condition:
@@ -108,18 +116,3 @@ class DepthFMPipeline(DepthDiffusionPipeline):
             return stretched(depth), None
         width = depth.amax((1, 2, 3), keepdim=True) - depth.amin((1, 2, 3), keepdim=True)
         return stretched(depth), members.exp().std(dim=1) / width.clamp_min(torch.finfo(depth.dtype).tiny)
-
-
-class DepthFMPrior(DepthPrior):
-    """DepthFM: rectified flow, log depth, a prompt that is part of the weights."""
-
-    pipeline_class = DepthFMPipeline
-
-    @staticmethod
-    def recognises(layout: Layout) -> bool:
-        """Eight channels in, a saved prompt, a scheduler of rectified flow (which alone has a ``shift``)."""
-        return (
-            layout.config("unet").get("in_channels") == 8
-            and bool(layout.config("prompt"))
-            and "shift" in layout.config("scheduler")
-        )

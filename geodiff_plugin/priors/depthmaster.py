@@ -10,7 +10,6 @@ from diffusers import AutoencoderKL, UNet2DConditionModel
 from torch import Tensor, nn
 from transformers import CLIPTextModel, CLIPTokenizer
 
-from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators
@@ -98,23 +97,6 @@ class DepthMasterPipeline(DepthDiffusionPipeline):
         modules = {"unet": unet, "vae": vae, "text_encoder": text_encoder, "tokenizer": tokenizer}
         self.register_prior(modules, *defaults)
 
-    def prepare_condition(
-        self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
-    ) -> Condition:
-        """Mode of the image latent's posterior, and the empty prompt."""
-        latent = self.image_latents(image, ensemble_size, batch_size)  # (N * E, 4, h, w)
-        return {"image_latent": latent, "prompt": self.prompt_embedding(latent)}
-
-    def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
-        """The clean depth latent; ``latents`` are not looked at."""
-        return self.run_unet(condition["image_latent"], timestep, condition)
-
-
-class DepthMasterPrior(DepthPrior):
-    """DepthMaster: a U-Net on the image latent alone, and no scheduler."""
-
-    pipeline_class = DepthMasterPipeline
-
     @staticmethod
     def recognises(layout: Layout) -> bool:
         """Four channels in, no class embedding, a text encoder, no scheduler among the components."""
@@ -125,3 +107,14 @@ class DepthMasterPrior(DepthPrior):
             and "text_encoder" in layout.index
             and "scheduler" not in layout.index
         )
+
+    def prepare_condition(
+        self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
+    ) -> Condition:
+        """Mode of the image latent's posterior, and the empty prompt."""
+        latent = self.image_latents(image, ensemble_size, batch_size)  # (N * E, 4, h, w)
+        return {"image_latent": latent, "prompt": self.prompt_embedding(latent)}
+
+    def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
+        """The clean depth latent; ``latents`` are not looked at."""
+        return self.run_unet(condition["image_latent"], timestep, condition)

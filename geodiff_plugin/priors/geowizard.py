@@ -13,13 +13,14 @@ from transformers import CLIPTextModel, CLIPTokenizer, CLIPVisionModelWithProjec
 from transformers.image_utils import OPENAI_CLIP_MEAN, OPENAI_CLIP_STD
 
 from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.loading import Layout, build_pipeline, load_component
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, stretched
 
 DOMAINS = ("indoor", "outdoor", "object")
 #: Width of the class embedding -> further condition of the U-Net: the image in v1, the domain as text in v2.
 IMAGE_EMBEDDING, TEXT_PROMPT = 10, 4
+#: The authors' subfolder of the second version.
+UNET_V2 = "unet_v2"
 #: Added to the length of a decoded normal before dividing by it.
 EPS_LENGTH = 1e-5
 
@@ -35,6 +36,8 @@ class PairAttention(AttnProcessor2_0):
 
 class GeoWizardPipeline(DepthDiffusionPipeline):
     """GeoWizard v1 (conditioned on the image through CLIP) and v2 (on the domain as text).
+
+    Guidance touches the depth half alone.
 
     Convention:
         Normals are unit vectors of the left camera's frame (x right, y down, z forward) on the side of the
@@ -73,6 +76,27 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         domain = check_choice(default_domain, "default_domain", DOMAINS)
         modules = {"unet": unet, "vae": vae, "scheduler": scheduler, **parts}
         self.register_prior(modules, *defaults, default_domain=domain)
+
+    @staticmethod
+    def recognises(layout: Layout) -> bool:
+        """A U-Net from 8 to 4 channels with a class embedding of 10 numbers (v1) or of 4 (v2).
+
+        So is that of a Lotus-G; of v2 the name of the subfolder or the domain that we save must tell, too.
+        """
+        unet = layout.config(_unet_folder(layout))
+        if (unet.get("in_channels"), unet.get("out_channels")) != (8, 4):
+            return False
+        width = unet.get("projection_class_embeddings_input_dim")
+        is_v2 = _unet_folder(layout) == UNET_V2 or "default_domain" in layout.index
+        return width == IMAGE_EMBEDDING or (width == TEXT_PROMPT and is_v2)
+
+    @classmethod
+    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> GeoWizardPipeline:
+        """From our folder or the authors', whose v2 holds ``unet_v2`` and parts of Stable Diffusion 2."""
+        unet = None
+        if _unet_folder(layout) == UNET_V2:
+            unet = load_component(layout, UNET_V2, UNet2DConditionModel, dtype)
+        return build_pipeline(cls, layout, dtype, unet=unet, prediction_type=space)
 
     def prepare_condition(
         self,
@@ -154,39 +178,6 @@ def couple_pairs(unet: UNet2DConditionModel) -> None:
     """Let every self-attention of the transformer blocks see the pair; it has no weights of its own."""
     names = (name for name in unet.attn_processors if name.endswith("attn1.processor"))
     unet.set_attn_processor(unet.attn_processors | dict.fromkeys(names, PairAttention()))
-
-
-UNET_V2 = "unet_v2"
-
-
-class GeoWizardPrior(DepthPrior):
-    """Depth and normals from one noise; guidance touches the depth half alone.
-
-    The domain is an argument of the call: ``pipe(image, domain="outdoor", guidance=...)``.
-    """
-
-    pipeline_class = GeoWizardPipeline
-
-    @staticmethod
-    def recognises(layout: Layout) -> bool:
-        """A U-Net from 8 to 4 channels with a class embedding of 10 numbers (v1) or of 4 (v2).
-
-        So is that of a Lotus-G; of v2 the name of the subfolder or the domain that we save must tell, too.
-        """
-        unet = layout.config(_unet_folder(layout))
-        if (unet.get("in_channels"), unet.get("out_channels")) != (8, 4):
-            return False
-        width = unet.get("projection_class_embeddings_input_dim")
-        is_v2 = _unet_folder(layout) == UNET_V2 or "default_domain" in layout.index
-        return width == IMAGE_EMBEDDING or (width == TEXT_PROMPT and is_v2)
-
-    @classmethod
-    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> GeoWizardPipeline:
-        """From our folder or the authors', whose v2 holds ``unet_v2`` and parts of Stable Diffusion 2."""
-        unet = None
-        if _unet_folder(layout) == UNET_V2:
-            unet = load_component(layout, UNET_V2, UNet2DConditionModel, dtype)
-        return build_pipeline(cls.pipeline_class, layout, dtype, unet=unet, prediction_type=space)
 
 
 def _unet_folder(layout: Layout) -> str:

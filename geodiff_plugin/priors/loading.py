@@ -22,7 +22,6 @@ from yaml import YAMLError
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors import components
-from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 
 BUNDLED_FOLDER = Path(__file__).resolve().parents[1] / "bundled" / "prior"
 
@@ -168,8 +167,8 @@ def _component_class(pipeline_class: type[Any], layout: Layout, name: str) -> ty
 
 
 def _annotated(pipeline_class: type[Any]) -> dict[str, type[Any]]:
-    """Component classes of a ``DepthDiffusionPipeline`` by the names of its constructor's parameters."""
-    if not issubclass(pipeline_class, DepthDiffusionPipeline):
+    """Component classes by the names of a constructor's parameters; none of a pipeline of diffusers."""
+    if pipeline_class.__module__.startswith("diffusers."):
         return {}
     found = {}
     for name, hint in typing.get_type_hints(pipeline_class.__init__).items():

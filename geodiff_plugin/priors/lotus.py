@@ -11,7 +11,6 @@ from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.components import DirectScheduler, SidesOf
 from geodiff_plugin.priors.loading import Layout, build_pipeline
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, map_of
@@ -61,6 +60,24 @@ class LotusPipeline(DepthDiffusionPipeline):
         modules = {"unet": unet, "vae": vae, "text_encoder": text_encoder, "tokenizer": tokenizer}
         self.register_prior(modules | {"scheduler": scheduler}, *defaults, SidesOf(1))
 
+    @staticmethod
+    def recognises(layout: Layout) -> bool:
+        """A U-Net with 4-d projected class labels, on the image latent alone (D) or with noise (G)."""
+        unet = layout.config("unet")
+        return (
+            unet.get("class_embed_type") == "projection"
+            and unet.get("projection_class_embeddings_input_dim") == 4
+            and unet.get("in_channels") in (4, 8)
+            and unet.get("_class_name") == "UNet2DConditionModel"
+        )
+
+    @classmethod
+    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> LotusPipeline:
+        """The folder's networks; its scheduler, if any, is not used."""
+        space = space or layout.index.get("prediction_type") or space_of_name(layout.name)
+        scheduler = DirectScheduler(timestep=TIMESTEP)
+        return build_pipeline(cls, layout, dtype, scheduler=scheduler, prediction_type=space)
+
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
     ) -> Condition:
@@ -81,14 +98,14 @@ class LotusPipeline(DepthDiffusionPipeline):
             sample = torch.cat([sample, latents], dim=1)
         return self.run_unet(sample, timestep, condition)
 
-    def encode_relative(self, x: Tensor) -> Tensor:
+    def encode(self, x: Tensor) -> Tensor:
         """Of whole cells of 8 pixels only, as the map that is decoded; beyond them a guided call repeats it.
 
         (The authors stretch instead, which moves the map by up to 7 pixels.)
         """
         cell = 2 ** (len(self.vae.config.block_out_channels) - 1)
         height, width = (side // cell * cell for side in x.shape[-2:])
-        return super().encode_relative(x[..., :height, :width])
+        return super().encode(x[..., :height, :width])
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """As the authors end: every channel is clipped; whole cells only, which the resizing stretches."""
@@ -106,27 +123,3 @@ def space_of_name(name: str) -> str:
     expected = "named as its authors named it (lotus-depth-g-v1-0, lotus-depth-g-v2-1-disparity)"
     cure = "Only the name tells depth from disparity; say which with --space or space=."
     bad_value("prior", expected, repr(name), cure)
-
-
-class LotusPrior(DepthPrior):
-    """Adapter of ``LotusPipeline``."""
-
-    pipeline_class = LotusPipeline
-
-    @staticmethod
-    def recognises(layout: Layout) -> bool:
-        """A U-Net with 4-d projected class labels, on the image latent alone (D) or with noise (G)."""
-        unet = layout.config("unet")
-        return (
-            unet.get("class_embed_type") == "projection"
-            and unet.get("projection_class_embeddings_input_dim") == 4
-            and unet.get("in_channels") in (4, 8)
-            and unet.get("_class_name") == "UNet2DConditionModel"
-        )
-
-    @classmethod
-    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> LotusPipeline:
-        """The folder's networks; its scheduler, if any, is not used."""
-        space = space or layout.index.get("prediction_type") or space_of_name(layout.name)
-        scheduler = DirectScheduler(timestep=TIMESTEP)
-        return build_pipeline(cls.pipeline_class, layout, dtype, scheduler=scheduler, prediction_type=space)

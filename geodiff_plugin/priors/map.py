@@ -15,7 +15,6 @@ from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.algorithm.finish import sharpen_edges
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
 from geodiff_plugin.geometry import image_size
-from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DirectMapPipeline, Generators
@@ -62,6 +61,19 @@ class DepthMapPipeline(DirectMapPipeline):
             if isinstance(target, (str, int, torch.device)):
                 self._place = torch.device(target)
         return self
+
+    @staticmethod
+    def recognises(layout: Layout) -> bool:
+        """A pipeline that consists of a ``DirectScheduler`` alone."""
+        parts = [name for name, value in layout.index.items() if isinstance(value, list)]
+        return parts == ["scheduler"] and layout.index["scheduler"][1] == DirectScheduler.__name__
+
+    @classmethod
+    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> DepthMapPipeline:
+        """A pipeline without weights; of ``"map"`` the values are depth unless ``space`` says otherwise."""
+        if layout == MAP_LAYOUT:
+            return cls(DirectScheduler(timestep=0), space or "depth")
+        return super().load(layout, dtype, space)
 
     def prepare_condition(
         self,
@@ -139,22 +151,3 @@ def _resized(values: Tensor, left_01: Tensor) -> Tensor:
     if ratio < ENLARGED:
         return resized
     return 1.0 / sharpen_edges(1.0 / (resized + OFFSET), left_01, round(ratio)) - OFFSET
-
-
-class DepthMapPrior(DepthPrior):
-    """Adapter of ``DepthMapPipeline``: scale, shift and a residual per pixel can be guided."""
-
-    pipeline_class = DepthMapPipeline
-
-    @staticmethod
-    def recognises(layout: Layout) -> bool:
-        """A pipeline that consists of a ``DirectScheduler`` alone."""
-        parts = [name for name, value in layout.index.items() if isinstance(value, list)]
-        return parts == ["scheduler"] and layout.index["scheduler"][1] == DirectScheduler.__name__
-
-    @classmethod
-    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> DepthMapPipeline:
-        """A pipeline without weights; of ``"map"`` the values are depth unless ``space`` says otherwise."""
-        if layout == MAP_LAYOUT:
-            return cls.pipeline_class(DirectScheduler(timestep=0), space or "depth")
-        return super().load(layout, dtype, space)

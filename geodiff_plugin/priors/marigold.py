@@ -12,22 +12,23 @@ from diffusers import AutoencoderKL, DDIMScheduler, MarigoldDepthPipeline, UNet2
 from torch import Tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
-from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.priors.base import DepthPrior
-from geodiff_plugin.priors.loading import Layout
-from geodiff_plugin.priors.pipeline import decode_picture, encode_picture, map_of, picture_of
-from geodiff_plugin.scale.space import SPACES
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.priors.loading import Layout, build_pipeline
+from geodiff_plugin.priors.pipeline import DepthPrior, decode_picture, encode_picture, map_of, picture_of
 
 
 class MarigoldPrior(DepthPrior):
     """Adapter of ``MarigoldDepthPipeline``; its ``prediction_type`` must be a key of ``SPACES``."""
 
-    pipeline_class = MarigoldDepthPipeline
+    pipeline_class: type[Any] = MarigoldDepthPipeline
 
     def __init__(self, pipe: Any) -> None:
-        super().__init__(pipe)
-        self.space = check_choice(self.space or "depth", "the pipeline's prediction_type", SPACES)
-        self.network_input = slice(pipe.vae.config.latent_channels, None)  # after the image latent
+        self._pipe, self.config = pipe, pipe.config
+
+    @property
+    def network_input(self) -> slice:
+        """What follows the image latent."""
+        return slice(self._pipe.vae.config.latent_channels, None)
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
@@ -44,7 +45,8 @@ class MarigoldPrior(DepthPrior):
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> Any:
         """The stock pipeline; folders of v1-0 do not say what they predict, which is depth."""
-        return super().load(layout, dtype, space or layout.index.get("prediction_type") or "depth")
+        space = space or layout.index.get("prediction_type") or "depth"
+        return build_pipeline(cls.pipeline_class, layout, dtype, prediction_type=space)
 
     def network(self) -> tuple[torch.nn.Module, str]:
         """The U-Net's forward; its input is ``cat[image latent, depth latent]``."""
@@ -66,9 +68,6 @@ class E2EFTPipeline(MarigoldDepthPipeline):
     at all (the authors read ``pred_original_sample`` instead). Arguments as ``MarigoldDepthPipeline``'s;
     ``initial_latents`` is saved, so that the folder differs from Marigold's.
     """
-
-    max_steps = 1
-    deterministic = True
 
     def __init__(
         self,
@@ -110,6 +109,8 @@ class E2EFTPrior(MarigoldPrior):
     """Adapter of ``E2EFTPipeline``; network, input and decoder are Marigold's."""
 
     pipeline_class = E2EFTPipeline
+    max_steps = 1
+    deterministic = True
 
     @staticmethod
     def recognises(layout: Layout) -> bool:

@@ -12,7 +12,6 @@ from diffusers import (
 from diffusers.utils.accelerate_utils import apply_forward_hook
 from torch import Tensor
 
-from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.components import FixedPrompt, SidesOf
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, map_of, widened
@@ -91,6 +90,15 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
         modules = {"transformer": transformer, "vae": vae, "scheduler": scheduler, "prompt": prompt}
         self.register_prior(modules, *defaults, SidesOf(SIDE, grow=True), sample_latent=sample_latent)
 
+    @staticmethod
+    def recognises(layout: Layout) -> bool:
+        """A transformer over joint image and text tokens, a video autoencoder, a saved prompt."""
+        return (
+            "joint_attention_dim" in layout.config("transformer")
+            and "latents_mean" in layout.config("vae")
+            and bool(layout.config("prompt"))
+        )
+
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
     ) -> Condition:
@@ -142,18 +150,3 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """As the authors end: every channel is clipped, then their mean taken."""
         return map_of(self.decode_picture(latents).clamp(-1.0, 1.0))
-
-
-class MarigoldV2Prior(DepthPrior):
-    """Marigold V2: one step of a transformer on the image's latent, in log, linear or inverse depth."""
-
-    pipeline_class = MarigoldV2Pipeline
-
-    @staticmethod
-    def recognises(layout: Layout) -> bool:
-        """A transformer over joint image and text tokens, a video autoencoder, a saved prompt."""
-        return (
-            "joint_attention_dim" in layout.config("transformer")
-            and "latents_mean" in layout.config("vae")
-            and bool(layout.config("prompt"))
-        )

@@ -1,8 +1,4 @@
-"""The loop of the priors that diffusers has no pipeline for, with what a prior's author writes for it.
-
-A subclass says how its network is called; preprocessing, batching, ensembling and resizing are those of
-``MarigoldDepthPipeline``, whose call signature and meaning are kept, so that guidance works on it unchanged.
-"""
+"""What guidance asks of a prior, and the loop of those that diffusers has no pipeline for (paper S4)."""
 
 from __future__ import annotations
 
@@ -20,6 +16,8 @@ from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number
+from geodiff_plugin.priors.loading import Layout, build_pipeline
+from geodiff_plugin.scale.space import SPACES
 
 Condition = dict[str, Tensor]
 Generators = torch.Generator | list[torch.Generator] | None
@@ -74,31 +72,82 @@ class DepthOutput(MarigoldDepthOutput):
     extras: dict[str, np.ndarray | Tensor] = field(default_factory=dict)
 
 
-class DepthDiffusionPipeline(DiffusionPipeline):
-    """Depth of an image by a latent (or pixel) diffusion prior.
+class DepthPrior:
+    """What guidance asks of a prior, which never sees a camera.
 
-    A subclass registers its modules and overrides ``prepare_condition``, ``denoise`` and what else it needs.
+    A ``DepthDiffusionPipeline`` is one itself; for a pipeline of diffusers an adapter is written, as
+    ``MarigoldPrior``.
 
     Attributes:
-        max_steps: most denoising steps that make sense, ``None`` for any number.
-        deterministic: the same image gives the same map, whatever the generator.
-        depth_channels: which channels of the latents are depth; others are never guided.
-        sees_latents: whether the network is given the latents (else there is no z_t).
-        takes_prompt: whether the call takes ``prompt_depth``, depths that the network starts from.
-        output_resampling: how its authors bring the map to the image's size.
-        own_range: of a prior that is metric by itself, ``(N * E, 2)`` metres at 0 and at 1 of the maps;
-            ``prepare_condition`` sets it.
-        valid: ``(N * E, 1, H, W)`` bool, where the prior says anything, ``None`` for everywhere; likewise.
+        config: of the pipeline; its ``prediction_type`` says what the decoded map is affine in.
+        max_steps: most denoising steps that make sense, ``None`` for any number. A guided call of a prior
+            with one step makes as many updates in it as it would have made in ``min_steps`` steps.
+        deterministic: the same image gives the same map, so that an ensemble has one member.
+        takes_prompt: the call takes ``prompt_depth``, depths that the network starts from.
+        depth_channels: those of the scheduler's latents that are depth; no gradient step touches the others.
+        own_range: of a prior that is metric by itself, ``(N * E, 2)`` metres at 0 and at 1 of its maps.
+        valid: ``(N * E, 1, H, W)`` bool, where on the processing grid it says anything; ``None`` for all.
     """
 
+    config: Any
     max_steps: int | None = None
     deterministic = False
-    depth_channels = slice(None)
-    sees_latents = True
     takes_prompt = False
-    output_resampling = "bilinear"
+    depth_channels = slice(None)
     own_range: Tensor | None = None
     valid: Tensor | None = None
+
+    @property
+    def space(self) -> str:
+        """What the decoded map is affine in, key of ``SPACES``; depth where the config does not say."""
+        said = self.config.get("prediction_type") or "depth"
+        return check_choice(said, "the pipeline's prediction_type", SPACES)
+
+    @property
+    def network_input(self) -> slice | None:
+        """Channels of the network's first argument that are z_t; ``None`` where only its output is guided."""
+        raise NotImplementedError
+
+    @staticmethod
+    def recognises(layout: Layout) -> bool:
+        """Whether a folder is of this kind, by its component configs, never by ``_class_name``."""
+        return False
+
+    @classmethod
+    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> Any:
+        """The pipeline of a folder that it recognises; ``space`` is what the user said, or ``None``."""
+        return build_pipeline(cls, layout, dtype, prediction_type=space)
+
+    def network(self) -> tuple[Any, str]:
+        """Where the loop calls the network once a step: an object and the name of the method on it."""
+        raise NotImplementedError
+
+    def decode(self, z0: Tensor) -> Tensor:
+        """Unclipped relative map ``(B, 1, H, W)``, about [0, 1], float32 or wider, of the depth channels.
+
+        It may lack the rows and columns beyond the last whole cell of the latent; a guided call repeats them.
+        """
+        raise NotImplementedError
+
+    def encode(self, x: Tensor) -> Tensor:
+        """About the inverse of ``decode``, of a map on the padded grid, beyond [0, 1] as far as it goes."""
+        raise NotImplementedError
+
+
+class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
+    """Depth of an image by a latent (or pixel) diffusion prior.
+
+    A subclass says how its network is called, by ``prepare_condition`` and ``denoise``, and overrides what
+    else it needs. Preprocessing, batching, ensembling and resizing are those of ``MarigoldDepthPipeline``,
+    as are the arguments of the call.
+
+    Attributes:
+        sees_latents: whether the network is given the latents (else there is no z_t).
+        output_resampling: how its authors bring the map to the image's size.
+    """
+
+    sees_latents = True
+    output_resampling = "bilinear"
 
     def register_prior(
         self,
@@ -111,13 +160,8 @@ class DepthDiffusionPipeline(DiffusionPipeline):
     ) -> None:
         """The last line of a subclass's constructor, whose parameters these are.
 
-        Args:
-            modules: by the names of the constructor's parameters.
-            prediction_type: what the relative map is affine in, key of ``scale.space.SPACES``.
-            default_denoising_steps: when a call names none.
-            default_processing_resolution: longer side, pixels; likewise.
-            image_processor: resizes and pads; or the number that padded sides are multiples of.
-            **config: further options to be saved.
+        ``image_processor`` resizes and pads, or is the number that padded sides are multiples of; ``config``
+        are further options to be saved.
         """
         self.register_modules(**modules)
         self.register_to_config(
@@ -132,6 +176,15 @@ class DepthDiffusionPipeline(DiffusionPipeline):
             image_processor = MarigoldImageProcessor(vae_scale_factor=image_processor)
         self.image_processor = image_processor
 
+    @property
+    def network_input(self) -> slice | None:
+        """The depth channels, if the network sees the latents."""
+        return self.depth_channels if self.sees_latents else None
+
+    def network(self) -> tuple[Any, str]:
+        """``denoise``."""
+        return self, "denoise"
+
     def prepare_condition(
         self,
         image: Tensor,
@@ -141,18 +194,10 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         *args: Any,
         **options: Any,
     ) -> Condition:
-        """Every input of the network beside latents and time.
+        """Every input of the network beside latents and time, ``N * E`` each, members side by side.
 
-        Args:
-            image: ``(N, 3, H, W)`` in [-1, 1], padded, of the pipeline's dtype.
-            ensemble_size: members E per image.
-            batch_size: images or members that one forward may take.
-            generator: for a prior that draws here (a posterior sample).
-            *args: nothing.
-            **options: a subclass names here what it adds to the call.
-
-        Returns:
-            Tensors by name, leading dimension ``N * E``, the members of an image side by side.
+        Of images ``(N, 3, H, W)`` in [-1, 1], padded, of the pipeline's dtype, with E members each, in
+        batches; ``generator`` is for a prior that draws here, ``options`` are what it adds to the call.
         """
         raise NotImplementedError
 
@@ -183,17 +228,17 @@ class DepthDiffusionPipeline(DiffusionPipeline):
         """About the inverse of ``decode_picture``, float32 or wider."""
         return encode_picture(self.vae, picture)
 
-    def decode_relative(self, z0: Tensor) -> Tensor:
-        """Unclipped relative map ``(B, 1, H, W)``, about [0, 1], float32 or wider, of the depth channels."""
+    def decode(self, z0: Tensor) -> Tensor:
+        """By ``decode_picture``."""
         return map_of(self.decode_picture(z0))
 
-    def encode_relative(self, x: Tensor) -> Tensor:
-        """About the inverse of ``decode_relative``, of a map beyond [0, 1] as far as it goes."""
+    def encode(self, x: Tensor) -> Tensor:
+        """By ``encode_picture``."""
         return self.encode_picture(picture_of(x))
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """What the unguided call gives: ``(B, 1, H, W)`` in [0, 1]; override for an author's own ending."""
-        return self.decode_relative(latents[:, self.depth_channels]).clamp(0.0, 1.0)
+        return self.decode(latents[:, self.depth_channels]).clamp(0.0, 1.0)
 
     def decode_extras(self, latents: Tensor, ensemble_size: int) -> dict[str, Tensor]:
         """Further maps by name, ``(N, C, H, W)`` on the padded grid, of latents ``(N * E, C, h, w)``."""
@@ -367,10 +412,10 @@ class DirectMapPipeline(DepthDiffusionPipeline):
         """The map, whatever the latents are."""
         return condition["image_latent"]
 
-    def decode_relative(self, z0: Tensor) -> Tensor:
+    def decode(self, z0: Tensor) -> Tensor:
         """The latent is the map."""
         return z0
 
-    def encode_relative(self, x: Tensor) -> Tensor:
+    def encode(self, x: Tensor) -> Tensor:
         """The map is the latent."""
         return x

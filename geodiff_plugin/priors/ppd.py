@@ -17,7 +17,6 @@ from diffusers.utils.accelerate_utils import apply_forward_hook
 from torch import Tensor, nn
 from transformers import Dinov2Model
 
-from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, widened
 
@@ -236,6 +235,12 @@ class PPDPipeline(DepthDiffusionPipeline):
         modules = {"dit": dit, "semantic_encoder": semantic_encoder, "scheduler": scheduler}
         self.register_prior(modules, *defaults, AreaImageProcessor(vae_scale_factor=SIDE))
 
+    @staticmethod
+    def recognises(layout: Layout) -> bool:
+        """A transformer on semantic tokens, beside the encoder that computes them."""
+        encoder = layout.config("semantic_encoder")
+        return "semantic_size" in layout.config("dit") and encoder.get("model_type") == "dinov2"
+
     def prepare_condition(
         self, image: Tensor, ensemble_size: int, batch_size: int, generator: Generators
     ) -> Condition:
@@ -259,27 +264,14 @@ class PPDPipeline(DepthDiffusionPipeline):
         joined = torch.cat([latents.to(condition["image"].dtype), condition["image"]], dim=1)
         return self.dit(joined, condition["semantics"], timestep)
 
-    def decode_relative(self, z0: Tensor) -> Tensor:
+    def decode(self, z0: Tensor) -> Tensor:
         """Clean depth is the map, but for its offset."""
         return widened(z0) + 0.5
 
-    def encode_relative(self, x: Tensor) -> Tensor:
+    def encode(self, x: Tensor) -> Tensor:
         """The map, but for its offset."""
         return x - 0.5
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
         """As the authors end: not clipped."""
-        return self.decode_relative(latents)
-
-
-class PPDPrior(DepthPrior):
-    """Adapter of ``PPDPipeline``: no VAE, so that decoding is an offset and the gradient its own."""
-
-    pipeline_class = PPDPipeline
-
-    @staticmethod
-    def recognises(layout: Layout) -> bool:
-        """A transformer on semantic tokens, beside the encoder that computes them."""
-        semantic_size = layout.config("dit").get("semantic_size")
-        encoder = layout.config("semantic_encoder")
-        return semantic_size is not None and encoder.get("model_type") == "dinov2"
+        return self.decode(latents)

@@ -11,7 +11,6 @@ from transformers import AutoModelForDepthEstimation, PreTrainedModel
 from transformers.models.auto.modeling_auto import MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES
 
 from geodiff_plugin._checks import bad_value, check_choice
-from geodiff_plugin.priors.base import DepthPrior
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import Layout, build_pipeline, load_component
 from geodiff_plugin.priors.pipeline import Condition, DirectMapPipeline, Generators
@@ -146,8 +145,8 @@ def _bicubic(values: Tensor, size: tuple[int, int]) -> Tensor:
 DEPTH_ARCHITECTURES = frozenset(MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES.values()) | {
     "Tipsv2DptForDensePrediction"
 }
-#: Those whose map is no depth, and what it is.
-NO_DEPTH = {"CHMv2ForDepthEstimation": "its map is the height of trees above the ground, seen from the air"}
+#: The map of this one is the height of trees above the ground, seen from the air.
+NO_DEPTH = "CHMv2ForDepthEstimation"
 #: The class that takes depths to start from, and gives metres with them.
 PROMPTED = "PromptDepthAnythingForDepthEstimation"
 SPACES = ("depth", "disparity")
@@ -178,12 +177,6 @@ def output_of(model: PreTrainedModel) -> tuple[str, bool]:
         return "disparity", bool(config.use_fov_model)
     cure = "Say what its output is affine in: space='depth' or space='disparity' (--space)."
     bad_value("the prior", "a depth model whose output is known", type(model).__name__, cure)
-
-
-def _check_is_depth(name: str) -> None:
-    """Refuse a class of ``transformers`` whose map is no depth, by its name."""
-    if name in NO_DEPTH:
-        bad_value("the prior", "a model of depth", name, f"It is refused because {NO_DEPTH[name]}.")
 
 
 def range_of(values: Tensor) -> tuple[Tensor, Tensor]:
@@ -225,7 +218,8 @@ class TransformersDepthPipeline(DirectMapPipeline):
         default_processing_resolution: int = 768,
     ) -> None:
         super().__init__()
-        _check_is_depth(type(model).__name__)
+        if type(model).__name__ == NO_DEPTH:
+            bad_value("prior", "a model of depth", f"{NO_DEPTH}, whose map is the height of trees")
         self.takes_prompt = type(model).__name__ == PROMPTED
         self.prepare = Preparation(preparation or {})
         try:
@@ -240,6 +234,25 @@ class TransformersDepthPipeline(DirectMapPipeline):
         defaults = space, default_denoising_steps, default_processing_resolution
         modules = {"model": model, "scheduler": scheduler}
         self.register_prior(modules, *defaults, image_processor=1, preparation=preparation)
+
+    @staticmethod
+    def recognises(layout: Layout) -> bool:
+        """An architecture that ``AutoModelForDepthEstimation`` knows, alone or as component ``model``."""
+        configs = layout.config(""), layout.config("model")
+        return any(DEPTH_ARCHITECTURES & set(config.get("architectures") or ()) for config in configs)
+
+    @classmethod
+    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> TransformersDepthPipeline:
+        """The model and the preparation of its images, from our folder or as the hub has it."""
+        if layout.index:
+            return build_pipeline(cls, layout, dtype, prediction_type=space)
+        config = next(filter(None, map(layout.read_json, PREPARATION_FILES)), None)
+        if config is None:
+            cure = "Fetch the whole folder anew: without it nobody knows how images are prepared."
+            bad_value(str(layout.folder), f"a folder with {PREPARATION_FILES[0]}", "none", cure)
+        model = load_component(layout, "", AutoModelForDepthEstimation, dtype, unread=UNREAD)
+        preparation = config.get("image_processor", config)  # a processor's file holds that of its images
+        return cls(model.requires_grad_(False), DirectScheduler(0), preparation, space)
 
     def prepare_condition(
         self,
@@ -305,30 +318,3 @@ class TransformersDepthPipeline(DirectMapPipeline):
         if self.prepare.kind in BILINEAR:
             return F.interpolate(values, size, mode="bilinear", align_corners=False)
         return _bicubic(values, size)
-
-
-class TransformersDepthPrior(DepthPrior):
-    """Adapter of ``TransformersDepthPipeline``: scale, shift and a residual per pixel can be guided."""
-
-    pipeline_class = TransformersDepthPipeline
-
-    @staticmethod
-    def recognises(layout: Layout) -> bool:
-        """An architecture that ``AutoModelForDepthEstimation`` knows, alone or as component ``model``."""
-        configs = layout.config(""), layout.config("model")
-        return any(DEPTH_ARCHITECTURES & set(config.get("architectures") or ()) for config in configs)
-
-    @classmethod
-    def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> TransformersDepthPipeline:
-        """The model and the preparation of its images, from our folder or as the hub has it."""
-        if layout.index:
-            return build_pipeline(cls.pipeline_class, layout, dtype, prediction_type=space)
-        for name in layout.config("").get("architectures", ()):
-            _check_is_depth(name)
-        config = next(filter(None, map(layout.read_json, PREPARATION_FILES)), None)
-        if config is None:
-            cure = "Fetch the whole folder anew: without it nobody knows how images are prepared."
-            bad_value(str(layout.folder), f"a folder with {PREPARATION_FILES[0]}", "none", cure)
-        model = load_component(layout, "", AutoModelForDepthEstimation, dtype, unread=UNREAD)
-        preparation = config.get("image_processor", config)  # a processor's file holds that of its images
-        return cls.pipeline_class(model.requires_grad_(False), DirectScheduler(0), preparation, space)

@@ -105,7 +105,7 @@ class StepEstimate:
     ) -> None:
         self._codec, self._level, self._output, self._z_t, self._tap = codec, level, output, z_t, tap
         self._wide = torch.promote_types(z_t.dtype, torch.float32)  # half precision ends here
-        self.output, wide_z_t = (x[:, codec.prior.latents].to(self._wide) for x in (output, z_t))
+        self.output, wide_z_t = (x[:, codec.prior.depth_channels].to(self._wide) for x in (output, z_t))
         self.eps = noise_from(self.output, wide_z_t, level)
         self.latent = z0_from(self.output, wide_z_t, level) if tap is None else tap.leaf
         self.encode, self.latent_is_read = codec.encode, latent_is_read
@@ -114,7 +114,7 @@ class StepEstimate:
         """The clean latent of a guided one: Tweedie with the network's graph in "full", else the same."""
         if self._tap is None:
             return latent
-        output = self._tap.output_at(latent)[:, self._codec.prior.latents].to(self._wide)
+        output = self._tap.output_at(latent)[:, self._codec.prior.depth_channels].to(self._wide)
         return z0_from(output, latent, self._level)
 
     def decode(self, z0: Tensor, final: bool = False) -> Tensor:
@@ -137,7 +137,7 @@ class StepEstimate:
         if from_moved:
             return self._output, self._put(self._z_t, moved), None
         nothing = torch.zeros_like(self._z_t, dtype=self._wide)
-        return self._output, self._z_t, put_channels(nothing, prior.latents, move)
+        return self._output, self._z_t, put_channels(nothing, prior.depth_channels, move)
 
     def _put(self, whole: Tensor, part: Tensor) -> Tensor:
-        return put_channels(whole, self._codec.prior.latents, part.to(whole.dtype))
+        return put_channels(whole, self._codec.prior.depth_channels, part.to(whole.dtype))

@@ -19,7 +19,7 @@ from tqdm.auto import tqdm
 from geodiff_plugin._checks import bad_type, bad_value, noted, refuse, warn
 from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.priors import find_adapter
+from geodiff_plugin.priors import prior_of
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.priors.tiny import tiny_autoencoder
 from geodiff_plugin.runtime.checks import (
@@ -105,7 +105,7 @@ class GuidedCall(_Stock):
     ) -> tuple[GuidedRun, Any]:
         """The stock call with everything in place; ``call`` becomes what it was given in the end."""
         lefts_01 = left_images(call["image"])  # (N, 3, H, W)
-        prior = find_adapter(self)(self)
+        prior = prior_of(self)
         check_arguments(call, len(lefts_01))
         asked = call["num_inference_steps"]
         wanted = guidance.denoising_steps(asked, self.default_denoising_steps)
@@ -240,7 +240,7 @@ def enable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
         InputError: no adapter in ``PRIORS`` understands it, or its ``__call__`` hides the stock arguments
             behind ``**kwargs``.
     """
-    find_adapter(pipe)
+    prior_of(pipe)
     check_named_arguments(_stock_class(type(pipe)) if isinstance(pipe, GuidedCall) else type(pipe))
     if not isinstance(pipe, GuidedCall):
         pipe.__class__ = _guided_class(pipe.__class__)

@@ -126,7 +126,7 @@ class GuidedRun:
         if (
             x is None
         ):  # else as it was encoded: decoding adds the autoencoder's loss and the scheduler's noise
-            x = self.prior.decode(latents[:, self.prior.latents]).float()
+            x = self.prior.decode(latents[:, self.prior.depth_channels]).float()
         x = self.grid.padded(x)
         self.relative.append(self.grid.cropped(x))
         trajectory.note("the map of the final latent", x)
@@ -182,7 +182,7 @@ class GuidedRun:
         first = len(self.trajectories) * self.batch_size
         chunk = slice(first, first + self.batch_size)
         start = None if self._warm is None else (self._warm.near_m[chunk], self._warm.far_m[chunk])
-        plan, prior = self._plan, self.prior
+        plan, prior, own_m = self._plan, self.prior, self.prior.own_range
         self.trajectories.append(
             Trajectory(
                 self.config,
@@ -190,9 +190,9 @@ class GuidedRun:
                 self.owners[chunk],
                 prior.space,
                 step_latents=plan.step_latents,
-                prior_range=prior.metric_range(chunk),
+                prior_range=None if own_m is None else own_m[chunk].unbind(1),
                 start_range=start,
-                valid=prior.valid(chunk),
+                valid=None if prior.valid is None else prior.valid[chunk],
             )
         )
         self._results.append(None)
@@ -259,7 +259,7 @@ class GuidedRun:
         if x is None:  # the steps before the first correction are the prior's own
             return dict.fromkeys(("metric_depth", "loss", "scale", "shift"))
         if self._step == len(self._timesteps) - 1:
-            x = self._codec.decode(latents[:, self.prior.latents], final=True)
+            x = self._codec.decode(latents[:, self.prior.depth_channels], final=True)
         return {
             "metric_depth": trajectory.metric(x, trajectory.affine),
             "loss": trajectory.history[-1].loss,

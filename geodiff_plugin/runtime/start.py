@@ -90,7 +90,7 @@ def _noise(z0: Tensor, prior: DepthPrior, call: Mapping[str, Any], device: torch
     """Noise for a latent: the call's own ``latents``, or drawn by its generator."""
     noise = call["latents"]
     if noise is None:
-        depth = z0[:, prior.latents]
+        depth = z0[:, prior.depth_channels]
         noise = randn_tensor(depth.shape, generator=call["generator"], device=device, dtype=z0.dtype)
         # What a prior denoises beside depth, GeoWizard's normals, starts from the same noise.
         return noise.repeat(1, z0.shape[1] // depth.shape[1], 1, 1)

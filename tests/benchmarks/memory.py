@@ -29,7 +29,7 @@ try:
 except ImportError:  # transformers 4
     from transformers.modeling_utils import no_init_weights
 
-from geodiff_plugin.priors import PRIORS
+from geodiff_plugin.priors import prior_of
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
 from tests.benchmarks.full_sizes import FULL_SIZES
 
@@ -125,7 +125,7 @@ def _peak(pipe: Any, prior: Any, gradient: str | None, weights: Sequence[Tensor]
     with _LiveBytes(weights) as counted:
         image = torch.zeros(1, 3, *SIZE, dtype=DTYPE)
         z, output = _step(pipe, image, gradient == "full")
-        z0 = output[:, prior.latents]
+        z0 = output[:, prior.depth_channels]
         if gradient == "denoised":
             z = z0 = z0.detach().requires_grad_()
         with torch.set_grad_enabled(gradient is not None):
@@ -151,7 +151,7 @@ def count_memory(key: str) -> Memory:
             torch.set_default_dtype(default)
         modules = [m for m in pipe.components.values() if isinstance(m, torch.nn.Module)]
         weights = [p for m in modules for p in m.requires_grad_(False).eval().parameters()]
-        prior, total = PRIORS[key](pipe), sum(p.numel() * p.element_size() for p in weights)
+        prior, total = prior_of(pipe), sum(p.numel() * p.element_size() for p in weights)
         four_bit = None
         if isinstance(pipe, MarigoldV2Pipeline):
             own = sum(p.numel() * p.element_size() for p in pipe.transformer.parameters())

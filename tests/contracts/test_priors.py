@@ -14,7 +14,7 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, disable_geometry_guidance, enable_geometry_guidance
 from geodiff_plugin.algorithm.gradients import RULES, Adam
-from geodiff_plugin.priors import PRIORS, find_adapter, find_prior
+from geodiff_plugin.priors import PRIORS, find_prior, prior_of
 from geodiff_plugin.priors.map import DepthMapPipeline
 from geodiff_plugin.scale.space import SPACES
 from tests.contracts.tiny_priors import CALL, TINY
@@ -32,10 +32,6 @@ def left(textured_plane):
 def tiny(key: str):
     """One live pipeline per key, which every test must leave as it was."""
     return TINY[key]()
-
-
-def prior_of(key: str):
-    return find_adapter(tiny(key))(tiny(key))
 
 
 @contextmanager
@@ -72,25 +68,25 @@ def test_a_saved_folder_is_recognised_without_class_name(key, left, tmp_path):
     pipe.save_pretrained(tmp_path)
     index_file = tmp_path / "model_index.json"
     index_file.write_text(json.dumps(json.loads(index_file.read_text()) | {"_class_name": "Anything"}))
-    space = prior_of(key).space
+    space = prior_of(tiny(key)).space
     found = find_prior(tmp_path)
     assert found.key == key
     loaded = found.load(space=space)
-    assert type(loaded) is type(pipe) and find_adapter(loaded) is PRIORS[key]
-    assert find_adapter(loaded)(loaded).space == space
+    assert type(loaded) is type(pipe) and type(prior_of(loaded)) is PRIORS[key]
+    assert prior_of(loaded).space == space
     loaded.set_progress_bar_config(disable=True)
     np.testing.assert_allclose(run(loaded, left).prediction, run(pipe, left).prediction, atol=1e-5)
 
 
 def test_it_says_what_guidance_must_know(key, left):
-    prior, pipe = prior_of(key), tiny(key)
+    prior, pipe = prior_of(tiny(key)), tiny(key)
     assert prior.space in SPACES
     assert prior.max_steps is None or prior.max_steps >= pipe.default_denoising_steps
     owner, method = prior.network()
     assert callable(getattr(owner, method))
     with torch.no_grad():
         latents = run(pipe, left).latent
-    z0 = latents[:, prior.latents].detach().requires_grad_()
+    z0 = latents[:, prior.depth_channels].detach().requires_grad_()
     x = prior.decode(z0)
     padded, _, _ = pipe.image_processor.preprocess(left, 64)
     assert x.shape == (1, 1, *padded.shape[-2:]) and x.dtype == torch.float32
@@ -116,7 +112,7 @@ def test_latents_that_are_no_tensor_are_refused_by_name(key, left):
 
 def test_guided_call_lowers_the_loss_and_restores(key, left, textured_plane, monkeypatch):
     """With the gradient through the network, where it sees what is guided."""
-    prior, seen = prior_of(key), []
+    prior, seen = prior_of(tiny(key)), []
 
     class Watched(Adam):
         def step(self, gradient, reference=None):
@@ -143,7 +139,7 @@ def test_guided_call_lowers_the_loss_and_restores(key, left, textured_plane, mon
 
 
 def test_no_gradient_step_touches_other_channels(key, left, textured_plane):
-    channels = prior_of(key).latents
+    channels = prior_of(tiny(key)).depth_channels
     if channels == slice(None):
         return
     with enabled(key) as pipe:
@@ -158,7 +154,8 @@ def test_no_gradient_step_touches_other_channels(key, left, textured_plane):
 
 
 def test_an_ensemble_has_a_spread_or_one_member(key, left, textured_plane):
-    guidance, once = guidance_for(textured_plane, inner_steps=0, min_steps=1), prior_of(key).deterministic
+    guidance = guidance_for(textured_plane, inner_steps=0, min_steps=1)
+    once = prior_of(tiny(key)).deterministic
     said = pytest.warns(UserWarning, match="one member runs") if once else nullcontext()
     with enabled(key) as pipe, said:
         out = run(pipe, left, guidance=guidance, ensemble_size=2, output_uncertainty=True)

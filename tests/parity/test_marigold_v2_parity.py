@@ -63,7 +63,7 @@ def compare(pipe, theirs, label):
     told = pipe.prepare_condition(reference.picture().to(pipe.dtype), 1, 1, None)
     call = {"processing_resolution": 0, "output_type": "pt", "output_latent": True}
     out = pipe(reference.picture() / 2 + 0.5, **call)
-    unclipped, final = 2 * pipe.decode_relative(out.latent) - 1, 2 * out.prediction.float() - 1
+    unclipped, final = 2 * pipe.decode(out.latent) - 1, 2 * out.prediction.float() - 1
     for name, ours in (
         ("image_latent", reference.keep_latent(told["image_latent"][0])),
         ("z0", reference.keep_latent(out.latent[0])),

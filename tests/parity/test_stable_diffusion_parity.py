@@ -89,7 +89,7 @@ def test_depthfm_equals_the_authors_code(depthfm):
     same(start, theirs["start"])
     same(torch.cat(velocities), theirs["velocities"])
     same(output.latent, theirs["end"])
-    same(2 * pipe.decode_relative(output.latent)[0, 0, ::8, ::8] - 1, theirs["decoded"])
+    same(2 * pipe.decode(output.latent)[0, 0, ::8, ::8] - 1, theirs["decoded"])
     same(output.prediction[0, ::8, ::8, 0], theirs["output"])
 
 
@@ -112,7 +112,7 @@ def test_depthmaster_equals_the_authors_code(monkeypatch):
     call = {"image": Image.fromarray(reference.image_u8()), "processing_resolution": 0, "output_latent": True}
     output = pipe(**call)
     same(output.latent, theirs["network"])
-    decoded = 2 * pipe.decode_relative(output.latent)[0, 0, ::4, ::4] - 1
+    decoded = 2 * pipe.decode(output.latent)[0, 0, ::4, ::4] - 1
     same(decoded, theirs["decoded"])
     assert decoded.abs().max() > 1, "the fixture must show that the decode does not clip"
     same(output.prediction[0, ::4, ::4, 0], theirs["output"])
@@ -180,7 +180,7 @@ def test_geowizard_equals_the_authors_code(case):
         same(pair[:, :, ::2, ::2], theirs[f"{case}/{name}"], name)
     with torch.no_grad():
         depth, normals = output.latent.chunk(2, dim=1)
-        unclipped = pipe.decode_relative(depth)[0, 0] * 2.0 - 1.0
+        unclipped = pipe.decode(depth)[0, 0] * 2.0 - 1.0
         assert unclipped.abs().max() > 1.0, "a case in which nothing is clipped says nothing"
         same(unclipped[::8, ::8], theirs[f"{case}/depth_unclipped"])
         same(pipe.decode_picture(normals)[0, :, ::8, ::8], theirs[f"{case}/normals_unscaled"])
@@ -237,7 +237,7 @@ def test_lotus_equals_the_authors_code(case, monkeypatch):
     call = {"processing_resolution": resolution, "output_latent": True}
     call["latents"] = drawn("noise", (1, *shape)) if channels == 8 else None
     out = quiet(pipe)(Image.fromarray(reference.image_u8(case)), **call)
-    seen["unclipped"] = reference.keep(pipe.decode_relative(out.latent)[0, 0])
+    seen["unclipped"] = reference.keep(pipe.decode(out.latent)[0, 0])
     seen["final"] = reference.keep(out.prediction[0, ..., 0])
     for name, ours in seen.items():
         same(ours, theirs[f"{case}/{name}"], name)

@@ -13,10 +13,10 @@ from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.algorithm.denoising import noise_from, output_from, z0_from
 from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.priors.components import DirectScheduler, SidesOf
-from geodiff_plugin.priors.depthmaster import DepthMasterPrior
-from geodiff_plugin.priors.geowizard import GeoWizardPipeline, GeoWizardPrior, closest_to_mean
+from geodiff_plugin.priors.depthmaster import DepthMasterPipeline
+from geodiff_plugin.priors.geowizard import GeoWizardPipeline, closest_to_mean
 from geodiff_plugin.priors.loading import Layout
-from geodiff_plugin.priors.lotus import LotusPipeline, LotusPrior, space_of_name
+from geodiff_plugin.priors.lotus import LotusPipeline, space_of_name
 from geodiff_plugin.priors.ppd import AreaImageProcessor
 from geodiff_plugin.runtime.noise_levels import check_scheduler, noise_level
 from tests.conftest import make_unet
@@ -116,9 +116,11 @@ def test_folders_as_geowizards_scripts_read_them(version, tmp_path):
     else:
         unet = ["models.unet_2d_condition", "UNet2DConditionModel"]
         index.write_text(json.dumps({"_class_name": "Anything", "unet": unet}))
-    assert GeoWizardPrior.recognises(Layout(tmp_path, "x"))
+    assert GeoWizardPipeline.recognises(Layout(tmp_path, "x"))
     call = {"num_inference_steps": 2, "processing_resolution": 64}
-    maps = (p(IMAGE, generator=seeded(), **call).prediction for p in (load(GeoWizardPrior, tmp_path), saved))
+    maps = (
+        p(IMAGE, generator=seeded(), **call).prediction for p in (load(GeoWizardPipeline, tmp_path), saved)
+    )
     np.testing.assert_array_equal(*maps)
 
 
@@ -142,12 +144,12 @@ def as_lotus_authors(pipe, folder) -> None:
 def test_folders_as_lotus_authors_wrote_them(kind, tmp_path):
     pipe, folder = make_lotus(kind), tmp_path / f"lotus-depth-{kind}-v1-0"
     as_lotus_authors(pipe, folder)
-    assert LotusPrior.recognises(Layout(folder, str(folder)))
-    loaded = load(LotusPrior, folder, str(folder))
+    assert LotusPipeline.recognises(Layout(folder, str(folder)))
+    loaded = load(LotusPipeline, folder, str(folder))
     assert loaded.config.prediction_type == "depth"
     maps = [p(IMAGE, processing_resolution=64, generator=seeded()).prediction for p in (pipe, loaded)]
     np.testing.assert_allclose(*maps, rtol=0, atol=1e-5)
-    assert LotusPrior(load(LotusPrior, folder, "x", "disparity")).space == "disparity"
+    assert load(LotusPipeline, folder, "x", "disparity").space == "disparity"
     plain = LotusPipeline.from_pretrained(folder, prediction_type="depth", local_files_only=True)
     assert plain.scheduler.config.timestep == 999
 
@@ -169,19 +171,19 @@ def test_relatives_are_told_apart(tmp_path):
     index = json.loads(index_of_2.read_text())
     index.pop("default_domain")  # what is left is the layout of a Lotus-G
     index_of_2.write_text(json.dumps(index))
-    assert not GeoWizardPrior.recognises(Layout(tmp_path / "2", "lotus"))
+    assert not GeoWizardPipeline.recognises(Layout(tmp_path / "2", "lotus"))
     folder = tmp_path / "master"
     make_depthmaster().save_pretrained(folder)
     index, config = (folder / "model_index.json").read_text(), folder / "unet" / "config.json"
     with_schedule = json.loads(index) | {"scheduler": ["diffusers", "DDIMScheduler"]}
     (folder / "model_index.json").write_text(json.dumps(with_schedule))
-    assert not DepthMasterPrior.recognises(Layout(folder, "stable diffusion"))
+    assert not DepthMasterPipeline.recognises(Layout(folder, "stable diffusion"))
     (folder / "model_index.json").write_text(index)
     UNet2DConditionModel.from_config(json.loads(config.read_text())).save_pretrained(folder / "unet")
     with pytest.raises(ValueError, match=r"missing: fftblock\.conv_f1\.bias"):
-        load(DepthMasterPrior, folder)
+        load(DepthMasterPipeline, folder)
     config.write_text(json.dumps(json.loads(config.read_text()) | {"class_embed_type": "projection"}))
-    assert not DepthMasterPrior.recognises(Layout(folder, "lotus d"))
+    assert not DepthMasterPipeline.recognises(Layout(folder, "lotus d"))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from geodiff_plugin._checks import InputError, InputTypeError
 from geodiff_plugin.evaluation import frames
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.options import SequenceOptions
-from geodiff_plugin.priors import find_adapter
+from geodiff_plugin.priors import prior_of
 from geodiff_plugin.runtime.start import plan_warm_start
 from geodiff_plugin.types import MetricDepthOutput
 from tests.scenes import render_sequence
@@ -70,7 +70,7 @@ def guided(pair, previous, **more):
 def planned(pipe, guidance, size=(48, 64), **told):
     """What a call of 4 steps would start with."""
     told = {"ensemble_size": 1, "num_inference_steps": 4, "latents": None, "generator": None} | told
-    return plan_warm_start(pipe, find_adapter(pipe)(pipe), guidance, told, size)
+    return plan_warm_start(pipe, prior_of(pipe), guidance, told, size)
 
 
 def call(pipe, pair, previous=None, warm_start=0.25, **told):

@@ -20,7 +20,7 @@ from geodiff_plugin.config import FAST, PAPER, PRIOR_FIT, GuidanceConfig, config
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.priors import find_adapter, load_prior
+from geodiff_plugin.priors import load_prior, prior_of
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runner import fingerprint
@@ -158,10 +158,6 @@ def call_arguments(settings: Settings) -> dict[str, Any]:
     return {"ensemble_size": settings.ensemble, "generator": generator} | arguments
 
 
-def _space(pipe: Any) -> str:
-    return find_adapter(pipe)(pipe).space
-
-
 def _notes(out: Any) -> dict[str, Any]:
     """Scale, shift, poses and visibility of a guided result, as JSON values."""
     notes: dict[str, Any] = {"warnings": list(out.warnings)}
@@ -185,7 +181,9 @@ def guided_prediction(
     spread = arguments.get("ensemble_size", 1) > 1
     out = pipe(Image.fromarray(sample.left), guidance=guidance, output_uncertainty=spread, **arguments)
     uncertainty, confidence = (None if m is None else m[0, ..., 0] for m in (out.uncertainty, out.confidence))
-    return Prediction(out.prediction[0, ..., 0], None, _space(pipe), uncertainty, confidence, _notes(out))
+    return Prediction(
+        out.prediction[0, ..., 0], None, prior_of(pipe).space, uncertainty, confidence, _notes(out)
+    )
 
 
 def _plain_configuration(settings: Settings) -> dict[str, Any]:
@@ -224,7 +222,7 @@ def _guidance(
 
 def _run_guided(preset: Preset, sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
     guidance, pipe = _guidance(sample, settings, priors, preset), priors.get(settings)
-    if needs_network(guidance) and find_adapter(pipe)(pipe).network_input is None:
+    if needs_network(guidance) and prior_of(pipe).network_input is None:
         raise NotApplicable("no gradient to z_t, which this prior's network does not see")
     return guided_prediction(pipe, sample, guidance, call_arguments(settings))
 
@@ -239,7 +237,7 @@ def _run_plain(sample: StereoSample, settings: Settings, priors: PriorCache) -> 
     """The paper's row "Marigold": an oracle aligns what comes out."""
     pipe = priors.get(settings)
     out = pipe(Image.fromarray(sample.left), **call_arguments(settings))
-    return Prediction(None, relative=out.prediction[0, ..., 0], space=_space(pipe))
+    return Prediction(None, relative=out.prediction[0, ..., 0], space=prior_of(pipe).space)
 
 
 def guided_map(
@@ -269,7 +267,7 @@ def _run_reprojection(sample: StereoSample, settings: Settings, priors: PriorCac
     relative = pipe(Image.fromarray(sample.left), **call).prediction[0, ..., 0]
     if settings.resolution is None:
         settings = replace(settings, resolution=pipe.default_processing_resolution or 0)
-    return guided_map(relative, _space(pipe), sample, settings, priors, _photometric_updates)
+    return guided_map(relative, prior_of(pipe).space, sample, settings, priors, _photometric_updates)
 
 
 class RampPrior(DepthDiffusionPipeline):
@@ -303,11 +301,11 @@ class RampPrior(DepthDiffusionPipeline):
         """The ramp's latent, whatever the latents."""
         return condition["image_latent"]
 
-    def decode_relative(self, z0: Tensor) -> Tensor:
+    def decode(self, z0: Tensor) -> Tensor:
         """By the prior's decoder."""
         return self.adapter.decode(z0)
 
-    def encode_relative(self, x: Tensor) -> Tensor:
+    def encode(self, x: Tensor) -> Tensor:
         """By the prior's encoder."""
         return self.adapter.encode(x)
 
@@ -315,7 +313,7 @@ class RampPrior(DepthDiffusionPipeline):
 def _run_ramp(preset: Preset, sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
     """A guided call on a ramp, with as many rounds of updates as the preset makes with this prior."""
     pipe = priors.get(settings)
-    adapter, asked = find_adapter(pipe)(pipe), preset(*posed_views(sample, settings.views))
+    adapter, asked = prior_of(pipe), preset(*posed_views(sample, settings.views))
     rounds = asked.denoising_steps(settings.steps, pipe.default_denoising_steps)
     module = next(part for part in pipe.components.values() if isinstance(part, torch.nn.Module))
     size = pipe.default_processing_resolution or 0
