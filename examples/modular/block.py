@@ -37,8 +37,8 @@ from transformers import CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.algorithm.schedule import count_steps
+from geodiff_plugin.guidance.inputs import left_images
 from geodiff_plugin.priors import prior_of
-from geodiff_plugin.runtime.checks import left_images
 from geodiff_plugin.runtime.estimate import ProcessingGrid
 from geodiff_plugin.runtime.hooks import frozen_weights
 from geodiff_plugin.runtime.output import assemble_output

@@ -37,9 +37,9 @@ from geodiff_plugin.formats.recordings import (
     write_depth_bag,
 )
 from geodiff_plugin.guidance.evidence import EvidenceStore
+from geodiff_plugin.guidance.inputs import left_images
 from geodiff_plugin.options import flag_of
 from geodiff_plugin.runner import BROKEN, Item, Journal, Runner
-from geodiff_plugin.runtime.checks import left_images
 from geodiff_plugin.runtime.machine import pick_device
 
 #: What became of every pair, as it is known to all processes of a run.

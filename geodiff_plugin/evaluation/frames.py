@@ -23,8 +23,8 @@ from geodiff_plugin.evaluation.options import CAPTURE_ROWS, WAYS, CaptureEvalOpt
 from geodiff_plugin.evaluation.tables import CellOf, Table, grouped, mean_of, most_of, table_of_groups
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.guidance.inputs import left_images
 from geodiff_plugin.runner import Item, Record, fingerprint
-from geodiff_plugin.runtime.checks import left_images
 
 #: What makes a sequence, by name; a checkout registers its renderer (tests/scenes/dataset.py).
 SEQUENCES: dict[str, Any] = {}

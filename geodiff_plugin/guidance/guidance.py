@@ -296,6 +296,16 @@ class GeometryGuidance:
         """Number, start and size of the gradient updates, with automatic choices resolved."""
         return self.config.plan_updates(points_given=self.inputs[0].points is not None)
 
+    @property
+    def moves_latents(self) -> bool:
+        """Whether gradient updates move the latent."""
+        return self.config.optimize_latents and self.updates.inner_steps > 0
+
+    @property
+    def through_network(self) -> bool:
+        """Whether gradients of z_t are taken through the network."""
+        return self.config.gradient == "full" and self.moves_latents
+
     def as_run(self) -> GuidanceConfig:
         """The configuration with all automatic choices resolved, for reports."""
         plan = self.updates

@@ -5,6 +5,7 @@ S3.3 has two views with known cameras; more views, and points, go beyond it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any
@@ -240,3 +241,31 @@ def split_views(
     if isinstance(images[0], Image.Image):
         warn_of_other_lens(images[0], K_left, "the left view's image")
     return (width, height), images[1:], Ks, Es
+
+
+def left_images(image: Any) -> Tensor:
+    """Left images ``(N, 3, H, W)`` float32 in [0, 1], read as right ones are; also ``(H, W)`` or a batch."""
+    named = list(_named(image, "image"))
+    if not named:
+        bad_value("image", "an image or a list of images", "an empty one")
+    tensors = [as_image_01(entry, name) for name, entry in named]
+    size = tensors[0].shape
+    for (name, _), tensor in zip(named, tensors, strict=True):
+        if tensor.shape != size:
+            expected = f"of {size[2]}x{size[1]} pixels, as {named[0][0]}"
+            got = f"{tensor.shape[2]}x{tensor.shape[1]}"
+            bad_value(name, expected, got, "Call once for every size.")
+    return torch.stack(tensors)
+
+
+def _named(image: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Every single image with its name in messages; of a batch with its index."""
+    several = isinstance(image, list)
+    if isinstance(image, (np.ndarray, Tensor)):
+        several = image.ndim == 4
+        image = image[None] if isinstance(image, Tensor) and image.ndim == 2 else image
+    if not several:
+        yield name, image
+        return
+    for i, entry in enumerate(image):
+        yield from _named(entry, f"{name}[{i}]")

@@ -49,7 +49,7 @@ def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
 @contextmanager
 def frozen_weights(pipe: Any) -> Iterator[None]:
     """``requires_grad`` off on every weight of a pipeline; otherwise each of them would keep a graph."""
-    flags = [(p, p.requires_grad) for module in _modules(pipe) for p in module.parameters()]
+    flags = [(p, p.requires_grad) for module in networks_of(pipe) for p in module.parameters()]
     for parameter, _ in flags:
         parameter.requires_grad_(False)
     try:
@@ -59,7 +59,8 @@ def frozen_weights(pipe: Any) -> Iterator[None]:
             parameter.requires_grad_(flag)
 
 
-def _modules(pipe: Any) -> list[torch.nn.Module]:
+def networks_of(pipe: Any) -> list[torch.nn.Module]:
+    """The components of a pipeline that have weights."""
     return [m for m in pipe.components.values() if isinstance(m, torch.nn.Module)]
 
 
@@ -91,7 +92,7 @@ class Exclusive:
     """
 
     def __init__(self, pipe: Any, guided: bool) -> None:
-        owners = [pipe, *_modules(pipe)] if guided else [pipe]
+        owners = [pipe, *networks_of(pipe)] if guided else [pipe]
         with _LOCKS_GUARD:
             locks = {id(lock): lock for lock in (_LOCKS.setdefault(o, threading.RLock()) for o in owners)}
         # All threads take them in the same order, so that no two wait for each other.

@@ -1,14 +1,11 @@
-"""Guidance on a live pipeline: switched on and off, and the guided call from its arguments to metric depth.
-
-Source: S4, Figure 3 (fig:framework).
-"""
+"""Guidance on a live pipeline: switched on and off, what it refuses, and the guided call (S4, Figure 3)."""
 
 from __future__ import annotations
 
 import copy
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -16,23 +13,21 @@ from diffusers import DiffusionPipeline, MarigoldDepthPipeline
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from geodiff_plugin._checks import bad_type, bad_value, noted, refuse, warn
+from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, noted, refuse, warn
 from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.priors import prior_of
-from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
-from geodiff_plugin.priors.tiny import tiny_autoencoder
-from geodiff_plugin.runtime.checks import (
-    check_arguments,
-    check_guidable,
-    check_named_arguments,
-    left_images,
-)
-from geodiff_plugin.runtime.estimate import ProcessingGrid
-from geodiff_plugin.runtime.hooks import Exclusive
+from geodiff_plugin.guidance.inputs import left_images
+from geodiff_plugin.priors import DepthPrior, prior_of
+from geodiff_plugin.priors.pipeline import RESAMPLING, DepthDiffusionPipeline
+from geodiff_plugin.runtime.estimate import ProcessingGrid, tiny_autoencoder
+from geodiff_plugin.runtime.hooks import Exclusive, networks_of
+from geodiff_plugin.runtime.noise_levels import check_scheduler
 from geodiff_plugin.runtime.output import assemble_output, ensemble_metric
 from geodiff_plugin.runtime.run import GuidedRun, StepCallback
 from geodiff_plugin.runtime.start import depth_prompt, plan_warm_start
+
+#: More than any call asks for, of steps, pixels or members.
+MOST = 1 << 20
 
 # Mixed in before a class that has all of a stock pipeline.
 _Stock: Any = MarigoldDepthPipeline if TYPE_CHECKING else object
@@ -106,13 +101,13 @@ class GuidedCall(_Stock):
         """The stock call with everything in place; ``call`` becomes what it was given in the end."""
         lefts_01 = left_images(call["image"])  # (N, 3, H, W)
         prior = prior_of(self)
-        check_arguments(call, len(lefts_01))
+        _check_arguments(call, len(lefts_01))
         asked = call["num_inference_steps"]
         wanted = guidance.denoising_steps(asked, self.default_denoising_steps)
         steps, rounds = count_steps(wanted, asked, prior.max_steps)
         resampling = call["resample_method_output"] or "bilinear"
         call |= {"num_inference_steps": steps, "resample_method_output": resampling}
-        check_guidable(self, prior, guidance)
+        _check_guidable(self, prior, guidance)
         tiny = tiny_autoencoder(self, guidance.config.decoder)
         if prior.deterministic and call["ensemble_size"] > 1:
             call |= _one_member(call)
@@ -183,15 +178,17 @@ class GuidedCall(_Stock):
 
 
 def _bind(stock_call: Callable[..., Any], *args: Any, **kwargs: Any) -> dict[str, Any]:
-    """All arguments of the stock call by name, defaults and what a prior adds included."""
+    """All arguments of the stock call by name, defaults and what a prior or a subclass adds included."""
     signature = inspect.signature(stock_call)
     bound = signature.bind(*args, **kwargs)
     bound.apply_defaults()
-    call = dict(bound.arguments)
+    given = dict(bound.arguments)
     for name, parameter in signature.parameters.items():
         if parameter.kind is parameter.VAR_KEYWORD:
-            call |= call.pop(name)
-    return call
+            given |= given.pop(name)
+    # A subclass may hide the stock arguments behind ``**kwargs``.
+    stock = inspect.signature(MarigoldDepthPipeline.__call__).parameters.values()
+    return {p.name: p.default for p in stock if p.default is not p.empty} | given
 
 
 def _check_guided_call(guidance: Any, callback: Any) -> None:
@@ -204,6 +201,63 @@ def _check_guided_call(guidance: Any, callback: Any) -> None:
             "Gradient updates (inner_steps) are not possible under torch.inference_mode(); "
             "use torch.no_grad() or nothing."
         )
+
+
+def _check_arguments(call: Mapping[str, Any], images: int) -> None:
+    """Refuse arguments of the call by name that no pipeline takes, for so many left images, in our own words.
+
+    What the stock pipeline refuses in a sentence that names the argument is left to it.
+    """
+    check_choice(call["output_type"], "output_type", ("np", "pt"))
+    check_choice(call["resample_method_input"], "resample_method_input", RESAMPLING)
+    check_choice(call["resample_method_output"] or "bilinear", "resample_method_output", RESAMPLING)
+    for name, least in (("num_inference_steps", 1), ("processing_resolution", 0)):
+        if call[name] is not None:
+            check_number(call[name], name, least, MOST, integer=True)
+    for name in ("batch_size", "ensemble_size"):
+        check_number(call[name], name, 1, MOST, integer=True)
+    given, members = call["generator"], images * call["ensemble_size"]
+    generators = given if isinstance(given, list) else [] if given is None else [given]
+    if not all(isinstance(generator, torch.Generator) for generator in generators):
+        bad_type("generator", "None, a torch.Generator or a list of them", given)
+    if isinstance(given, list) and len(given) != members:
+        expected = f"a torch.Generator, or a list of {members}: one for every image and member"
+        bad_value("generator", expected, f"a list of {len(given)}")
+    latents = call["latents"]
+    if isinstance(latents, Tensor) and not latents.isfinite().all():
+        bad_value("latents", "finite", "NaN or infinity in it")
+
+
+def _check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) -> None:
+    """Refuse a pipeline whose scheduler, offloading, casting or network cannot be guided as configured."""
+    check_scheduler(pipe.scheduler)
+    full = guidance.config.gradient == "full"
+    for network in networks_of(pipe):
+        differentiated = guidance.moves_latents and (full or network is getattr(pipe, "vae", None))
+        for module in network.modules():
+            _check_weights_stay(type(network).__name__, module, differentiated)
+    if full and getattr(pipe, "_all_hooks", None):
+        expected = "'denoised' with enable_model_cpu_offload()"
+        cure = "Decoding pushes the U-Net to the CPU before its backward pass; use gradient='denoised' or "
+        bad_value("gradient", expected, "'full'", cure + "pipe.to(device).")
+    if guidance.through_network and prior.network_input is None:
+        cure = "z_t is no input of its network, so only the clean latent can be moved."
+        bad_value("gradient", "'denoised' with this prior", "'full'", cure)
+
+
+def _check_weights_stay(name: str, module: torch.nn.Module, differentiated: bool) -> None:
+    """Refuse hooks that take weights away, or make others of them, before a backward pass needs them."""
+    registry, hook = getattr(module, "_diffusers_hook", None), getattr(module, "_hf_hook", None)
+    of_diffusers = "" if registry is None else " ".join(registry.hooks)
+    of_accelerate = [h for h in getattr(hook, "hooks", [hook]) if type(h).__name__ == "AlignDevicesHook"]
+    if any(h.offload for h in of_accelerate) or "group_offloading" in of_diffusers:
+        expected = "without sequential or group CPU offloading while guided"
+        cure = "The backward pass needs them: use pipe.enable_model_cpu_offload() or pipe.to(device)."
+        bad_value("pipe", expected, f"{name} whose weights leave the device after each forward", cure)
+    if differentiated and "layerwise_casting" in of_diffusers:
+        cure = "Leave inner_steps at 0, or load the pipeline in half precision."
+        got = f"{name} whose weights are cast after each layer"
+        bad_value("pipe", "without layerwise casting where gradients go through", got, cure)
 
 
 def _one_member(call: dict[str, Any]) -> dict[str, Any]:
@@ -237,11 +291,9 @@ def enable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
     """Let a live pipeline take ``guidance=``; nothing else about it changes. Returns the same object.
 
     Raises:
-        InputError: no adapter in ``PRIORS`` understands it, or its ``__call__`` hides the stock arguments
-            behind ``**kwargs``.
+        InputError: no adapter in ``PRIORS`` understands it.
     """
     prior_of(pipe)
-    check_named_arguments(_stock_class(type(pipe)) if isinstance(pipe, GuidedCall) else type(pipe))
     if not isinstance(pipe, GuidedCall):
         pipe.__class__ = _guided_class(pipe.__class__)
     return pipe

@@ -18,7 +18,6 @@ from geodiff_plugin.algorithm.state import Trajectory
 from geodiff_plugin.algorithm.step import guided_step
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import DepthPrior
-from geodiff_plugin.runtime.checks import needs_network
 from geodiff_plugin.runtime.estimate import MapCodec, ProcessingGrid, StepEstimate, StepInputs
 from geodiff_plugin.runtime.hooks import (
     DenoiserTap,
@@ -75,7 +74,7 @@ class GuidedRun:
         self._ends_m: list[tuple[Tensor, Tensor]] = []  # nearest and farthest of the final maps of a chunk
         self._stack, self._bar = ExitStack(), None
         self._tap = None
-        if needs_network(guidance) and prior.network_input is not None:
+        if guidance.through_network and prior.network_input is not None:
             self._tap = DenoiserTap(*prior.network(), prior.network_input)
         self._scheduler = GuidedScheduler(
             pipe,

@@ -7,8 +7,8 @@ import pytest
 import torch
 from diffusers import AutoencoderTiny
 
-from geodiff_plugin.priors import tiny as tiny_module
-from geodiff_plugin.priors.tiny import KNOWN, _loaded
+from geodiff_plugin.runtime import estimate
+from geodiff_plugin.runtime.estimate import KNOWN, _loaded
 from tests.conftest import guided_call, make_vae
 
 
@@ -84,7 +84,7 @@ def test_the_pipeline_is_left_as_found_by_an_error_in_the_loop(pipe, guided, fol
 
 
 def test_with_the_same_weights_in_the_loop_nothing_changes(guided, folder, monkeypatch):
-    monkeypatch.setattr(tiny_module, "_loaded", lambda *_: make_vae())
+    monkeypatch.setattr(estimate, "_loaded", lambda *_: make_vae())
     np.testing.assert_array_equal(guided(folder).prediction, guided().prediction)
 
 
@@ -118,6 +118,6 @@ def test_sd_2s_latent_is_known(pipe, guided, monkeypatch):
     loaded = Mock(return_value=make_vae())
     pipe.vae.register_to_config(scaling_factor=0.18215)
     monkeypatch.setitem(KNOWN, (4, 2, 0.18215), KNOWN[4, 8, 0.18215])  # a tiny one has cells of 2 pixels
-    monkeypatch.setattr(tiny_module, "_loaded", loaded)
+    monkeypatch.setattr(estimate, "_loaded", loaded)
     guided("tiny")
     assert {call.args[0] for call in loaded.call_args_list} == {"madebyollin/taesd"}

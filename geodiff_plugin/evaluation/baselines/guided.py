@@ -24,7 +24,6 @@ from geodiff_plugin.priors import load_prior, prior_of
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runner import fingerprint
-from geodiff_plugin.runtime.checks import needs_network
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.scale.space import SPACES
 
@@ -222,7 +221,7 @@ def _guidance(
 
 def _run_guided(preset: Preset, sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
     guidance, pipe = _guidance(sample, settings, priors, preset), priors.get(settings)
-    if needs_network(guidance) and prior_of(pipe).network_input is None:
+    if guidance.through_network and prior_of(pipe).network_input is None:
         raise NotApplicable("no gradient to z_t, which this prior's network does not see")
     return guided_prediction(pipe, sample, guidance, call_arguments(settings))
 
