@@ -1,7 +1,4 @@
-"""Pictures of depth maps (the figures of S5): colours and legends, contact sheets, overviews and videos.
-
-matplotlib is imported when the first picture is drawn, and draws without any global state.
-"""
+"""Pictures of depth maps (S5): colours and legends, contact sheets, overviews, videos; no global state."""
 
 from __future__ import annotations
 
@@ -21,6 +18,8 @@ from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_
 from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.formats.out import atomic_path, reason_of
 
+#: ``(H, W)``, of a picture ``(H, W, 3)``.
+Map = np.ndarray
 #: Lightness grows evenly in both, so equal steps look equal; neither has a colour near the grey of "unknown".
 DEPTH_COLOURS, SHARE_COLOURS = "plasma", "YlGnBu_r"
 GREY = 128
@@ -55,10 +54,7 @@ def _known(depth_m: np.ndarray) -> np.ndarray:
 
 
 def depth_range(depth_m: Any, near: float | None = None, far: float | None = None) -> tuple[float, float]:
-    """The depths at the two ends of the colours, ``0 < near < far`` in metres; by default 2 % lie beyond.
-
-    ``ValueError`` for a given end that is not above 0 and finite, or ``near >= far``.
-    """
+    """The depths at the ends of the colours, ``0 < near < far``, by default without 2 % on either side."""
     for name, value in (("near", near), ("far", far)):
         if value is not None:
             check_positive(value, name, "metres")
@@ -106,10 +102,7 @@ def _coloured(
 
 
 def colour_depth(depth_m: Any, near: float | None = None, far: float | None = None) -> np.ndarray:
-    """``(H, W, 3)`` uint8 RGB of a depth map: near is yellow, far is dark blue, unknown is grey.
-
-    The colours go with the logarithm of depth. Arguments and errors as for ``depth_range``.
-    """
+    """``(H, W, 3)`` uint8 of a depth map by its logarithm: near is yellow, far dark blue, unknown grey."""
     near, far = depth_range(depth_m, near, far)
     depth_m = _as_map(depth_m)
     scale = math.log(far / near)
@@ -140,10 +133,9 @@ def _sheet(picture: np.ndarray) -> Any:
     return figure
 
 
-def _figure(
-    picture: np.ndarray, colours: str, label: str, marks: Sequence[tuple[float, str]], unknown: bool
-) -> Image.Image:
+def _figure(picture: np.ndarray, colours: str, label: str, marks: Sequence[tuple[float, str]]) -> Image.Image:
     """A picture beside its colour bar with texts at shares of it; a grey key where pixels are unknown."""
+    unknown = bool((picture == GREY).all(axis=-1).any())  # no colour is grey
     factor = math.ceil(FIGURE_MIN_HEIGHT / len(picture))  # a whole one, so that pixels stay squares
     picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
     high, size = len(picture), max(12, len(picture) // 26)
@@ -171,22 +163,17 @@ def _figure(
 def depth_figure(
     depth_m: Any, near: float | None = None, far: float | None = None, unit: str | None = "m"
 ) -> Image.Image:
-    """A coloured depth map beside a colour bar, far on top; small maps are enlarged by a whole factor.
-
-    Arguments and errors as for ``depth_range``; ``unit`` is ``"m"``, or ``None`` for a depth without one.
-    """
+    """A coloured depth map, enlarged if small, beside a colour bar; no ``unit`` for a depth without."""
     near, far = depth_range(depth_m, near, far)
     marks = [(math.log(z / near) / math.log(far / near), f"{z:g}") for z in ticks(near, far)]
     label = "no unit" if unit is None else f"depth, {unit}"
-    picture, unknown = colour_depth(depth_m, near, far), not _known(_as_map(depth_m)).all()
-    return _figure(picture, f"{DEPTH_COLOURS}_r", label, marks, unknown)
+    return _figure(colour_depth(depth_m, near, far), f"{DEPTH_COLOURS}_r", label, marks)
 
 
 def share_figure(values: np.ndarray, label: str, top: float) -> Image.Image:
     """A map ``(H, W)`` of something from 0 to ``top`` (> 0), beside a colour bar under its ``label``."""
     marks = [(share, f"{share * top:.2g}") for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
-    unknown = not np.isfinite(values).all()
-    return _figure(colour_share(values, top), SHARE_COLOURS, label, marks, unknown)
+    return _figure(colour_share(values, top), SHARE_COLOURS, label, marks)
 
 
 def _as_picture(image: Any) -> Image.Image:
@@ -206,8 +193,7 @@ def grid(
 ) -> Image.Image:
     """A contact sheet: pictures side by side, each under its title, scaled to ``cell_width`` pixels.
 
-    Pictures are PIL images or arrays, as of matplotlib; a row, of ``columns`` (all, up to 4), is as high as
-    its highest. ``ValueError`` for none, or other titles.
+    PIL images or arrays; a row, of ``columns`` (all, up to 4), is as high as its highest.
     """
     pictures = [_as_picture(image) for image in images]
     if not pictures or len(titles) != len(pictures):
@@ -231,11 +217,7 @@ def grid(
 
 
 def overview(
-    left_01: np.ndarray,
-    depth_m: np.ndarray,
-    confidence: np.ndarray | None,
-    error: np.ndarray | None,
-    unit: str | None = "m",
+    left_01: Map, depth_m: Map, confidence: Map | None, error: Map | None, unit: str | None = "m"
 ) -> Image.Image:
     """Left image in [0, 1], depth, any confidence and photometric error (not finite if unseen), 2 a row."""
     every = max(1, depth_m.shape[1] // (2 * CELL_WIDTH))
@@ -255,15 +237,9 @@ def overview(
 
 
 def depth_frames(
-    depths_m: Sequence[np.ndarray],
-    near: float | None = None,
-    far: float | None = None,
-    unit: str | None = "m",
+    depths_m: Sequence[Map], near: float | None = None, far: float | None = None, unit: str | None = "m"
 ) -> Iterator[Image.Image]:
-    """One picture a depth map ``(H, W)``, all in the same colours; each is drawn when it is asked for.
-
-    Ends as in ``depth_range``, over all maps. ``ValueError`` for no maps, or maps of several shapes.
-    """
+    """One picture a map ``(H, W)``, in the same colours, drawn when it is asked for."""
     shapes, samples = set(), []
     for depth_m in depths_m:  # one pass: a map may be read from its file whenever it is asked for
         every = max(1, math.ceil(len(depths_m) * depth_m.size / (4 * MOST_FOR_RANGE)))

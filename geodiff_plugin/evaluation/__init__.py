@@ -1,4 +1,1 @@
-"""Evaluation: data sets, metrics, methods side by side, resumable runs, tables and figures.
-
-Paper: S5 (experiments).
-"""
+"""Evaluation: data sets, metrics, methods side by side, resumable runs, tables and figures (paper S5)."""

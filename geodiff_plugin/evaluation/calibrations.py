@@ -13,13 +13,14 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import InputError, bad_value, check_choice
+from geodiff_plugin.capture.agreement import DepthFrame
 from geodiff_plugin.evaluation import experiment, tables
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import call_arguments, guided_configuration
-from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load
+from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load, real_and_rendered
 from geodiff_plugin.evaluation.datasets.sample import changed_ref, two_numbers
 from geodiff_plugin.evaluation.experiment import Page, run_experiment
-from geodiff_plugin.evaluation.options import PosesOptions, TrustOptions, real_and_rendered
+from geodiff_plugin.evaluation.options import PosesOptions, TrustOptions
 from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs, headline, label_of
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runner import Item, Record
@@ -186,21 +187,12 @@ WRONG = [kind for kind in KINDS if kind not in RIGHT]
 
 def _points(sample: StereoSample) -> np.ndarray:
     """``(POINTS, 3)`` of the truth, metres in the left camera's frame."""
-    rows, columns = np.nonzero(sample.valid)
-    some = np.random.default_rng(0).permutation(len(rows))[:POINTS]
-    z = sample.depth_m[rows[some], columns[some]].astype(np.float64)
-    rays = np.stack([columns[some], rows[some], np.ones(len(some))], axis=1) @ np.linalg.inv(sample.K_left).T
-    return rays * z[:, None]
+    frame = DepthFrame("left", sample.depth_m, sample.valid, sample.K_left, np.eye(4))
+    points = frame.world(sample.valid)
+    return points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
 
 
-def _measure(
-    ref: SampleRef,
-    other: SampleRef,
-    kind: str,
-    read: Callable[[SampleRef], StereoSample],
-    pipe: Any,
-    settings: Settings,
-) -> Record:
+def _measure(ref: SampleRef, other: SampleRef, kind: str, read: Any, pipe: Any, settings: Settings) -> Record:
     """One guided call, what was said of it, and how far it is off."""
     original = read(ref).check_truth()
     _, change, factor = KINDS[kind]

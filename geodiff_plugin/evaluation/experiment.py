@@ -1,4 +1,4 @@
-"""An experiment: cells (samples x methods x settings), each measured once, and tables of their records.
+"""An experiment: cells (samples x methods x settings), each measured and scored once, and its page of tables.
 
 The cells of every command are the items of one ``Runner``: all resume and are shared by several processes.
 """
@@ -6,11 +6,12 @@ The cells of every command are the items of one ``Runner``: all resume and are s
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import re
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import date
 from functools import lru_cache, partial
@@ -19,23 +20,46 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import torch
+import torch.nn.functional as F
 
 from geodiff_plugin import __version__
-from geodiff_plugin.evaluation.baselines import Method, NotApplicable, PriorCache, Settings, find_method
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.capture.agreement import DepthFrame, seen_in
+from geodiff_plugin.evaluation import metrics
+from geodiff_plugin.evaluation.baselines import (
+    Method,
+    NotApplicable,
+    Prediction,
+    PriorCache,
+    Settings,
+    find_method,
+)
+from geodiff_plugin.evaluation.baselines.unguided import sweep
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample, load
+from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity
 from geodiff_plugin.evaluation.options import command_line
-from geodiff_plugin.evaluation.scoring import score
 from geodiff_plugin.evaluation.tables import Table
 from geodiff_plugin.formats import write_depth_npy
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import write_text
+from geodiff_plugin.matching import match_volume
 from geodiff_plugin.runner import Item, Journal, Record, Runner, fingerprint, this_process
+from geodiff_plugin.runtime.confidence import RIGHT_WITHIN
 from geodiff_plugin.runtime.machine import PeakMemory, versions
 
 #: Journal of methods on samples, which several commands share.
 RECORDS_NAME = "samples.jsonl"
 Tables = Callable[[list[Record]], Sequence[Table]]
+#: Material classes that Booster's authors call transparent or mirror when they score depth.
+TOM_CLASSES = (2, 3)
+#: Share of pixels with truth from which on its edges are there to be measured.
+DENSE = 0.5
+#: Confidence from which on a match of our plane sweep counts as one.
+RELIABLE_MATCH = 0.5
+
+Scores = dict[str, float | None]
 
 
 def run_facts(command: str, options: Any) -> dict[str, Any]:
@@ -87,20 +111,13 @@ def run_experiment(
     remarks: Callable[[list[Record]], Sequence[str]] = lambda records: (),
     journal: str = "",
 ) -> Page | None:
-    """Measure the cells that have no record yet, and write the page; ``None`` in any process but the first.
-
-    The payload of each cell is a ``partial`` that returns the body of its record. ``ValueError`` or
-    ``OSError`` for bad options or samples.
-    """
+    """Measure the cells without a record, and write the page; ``None`` in any process but the first."""
     records = measure_cells(cells, options, journal or f"{command}.jsonl")
     return None if records is None else write_page(command, options, title, tables(records), remarks(records))
 
 
 def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NAME) -> list[Record] | None:
-    """The records of cells, in order, each with the ``head`` of its cell; ``None`` as ``run_experiment``.
-
-    A cell that stands several times, or under several names, is measured once.
-    """
+    """The records of cells, in order, those of one key measured once; ``None`` as ``run_experiment``."""
     runner = Runner(
         list({cell.key: cell for cell in cells}.values()),
         Journal(options.out / journal),
@@ -115,22 +132,145 @@ def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NA
     return [records[cell.key] | dict(cell.head) for cell in cells if cell.key in records]
 
 
-def cell_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior: str = "") -> str:
-    """Name of a result: the same inputs give the same key, anything else another.
+def out_of_view(sample: StereoSample) -> np.ndarray:
+    """``(H, W)`` bool: pixels with truth that the true depth puts behind or beside the right image."""
+    left = DepthFrame("left", sample.depth_m, sample.valid, sample.K_left, np.eye(4))
+    right = DepthFrame("right", sample.right[..., 0], sample.right[..., 0], sample.K_right, sample.E_scored)
+    return sample.valid & ~seen_in(left, right)[3]
 
-    What is in a sample's files counts, not where they lie. ``prior`` is its name and fingerprint.
+
+@lru_cache(maxsize=1)
+def matched(sample: StereoSample) -> np.ndarray | None:
+    """``(H, W)`` bool: where our sweep, on the CPU and by the true poses, has a reliable match."""
+    try:
+        volume = sweep(replace(sample, E=sample.E_scored), "cpu")
+    except ValueError:
+        return None
+    matches = match_volume(volume)
+    reliable = (matches.confidence >= RELIABLE_MATCH).float()
+    return F.interpolate(reliable[None], sample.depth_m.shape, mode="nearest-exact")[0, 0].numpy() > 0
+
+
+def regions(sample: StereoSample) -> dict[str, np.ndarray]:
+    """Masks by which AbsRel is split, ``(H, W)`` bool, within ``sample.valid``, as far as they are known."""
+    masks = {"out_of_view": out_of_view(sample)}
+    by_match = matched(sample)
+    if by_match is not None:
+        masks |= {"matched": by_match, "unmatched": ~by_match}
+    if sample.occluded is not None:
+        hidden = sample.occluded & ~masks["out_of_view"]
+        masks |= {"occluded": hidden, "visible": ~hidden & ~masks["out_of_view"]}
+    if sample.material is not None:
+        tom = np.isin(sample.material, TOM_CLASSES)
+        masks |= {"tom": tom, "not_tom": ~tom}
+        for value in np.unique(sample.material[sample.valid]):
+            masks[f"material_{int(value)}"] = sample.material == value
+    return {name: sample.valid & mask for name, mask in masks.items()}
+
+
+def _plain(scores: Mapping[str, float | None]) -> Scores:
+    """Rounded to 7 digits; NaN becomes ``None``, which JSON has a word for."""
+    return {k: None if v is None or math.isnan(v) else float(f"{v:.7g}") for k, v in scores.items()}
+
+
+def _positive(depth_m: np.ndarray | None) -> np.ndarray:
+    """The map with NaN where it is not a positive number."""
+    assert depth_m is not None  # a prediction has metres where it has no relative map
+    return np.where(metrics.answered(depth_m), depth_m, np.nan)
+
+
+def disparity_scores(sample: StereoSample, depth_m: np.ndarray) -> dict[str, Scores]:
+    """``DISPARITY_METRICS`` of a rectified sample, of ``all`` pixels with truth and by region."""
+    cameras, valid = (sample.K_left, sample.K_right, sample.E_scored), sample.valid
+    true_px = depth_to_disparity(np.where(valid, sample.depth_m, 1.0), *cameras)
+    pred_px = depth_to_disparity(_positive(depth_m), *cameras)
+    masks, hidden = {"all": valid}, sample.occluded
+    if hidden is None and valid.mean() > DENSE:
+        hidden = metrics.hidden_by_truth(true_px, valid)
+    if hidden is not None:
+        masks["visible"] = valid & ~hidden & ~out_of_view(sample)
+    edge = metrics.near_disparity_steps(true_px, valid)
+    masks |= {"edge": edge, "flat": valid & ~edge}
+    step_px = float(sample.notes.get("disparity_step_px", 0.0))
+    return {
+        name: _plain(metrics.evaluate_disparity(pred_px, true_px, mask, step_px))
+        for name, mask in masks.items()
+        if mask.any()
+    }
+
+
+def _metric_scores(sample: StereoSample, prediction: Prediction, kept: np.ndarray) -> dict[str, Any]:
+    """What only a map in metres has: see ``score``."""
+    depth_m, truth, valid = prediction.depth_m, sample.depth_m, sample.valid
+    names = ("disparity", "ause", "confidence", "ause_confidence", "boundaries")
+    record: dict[str, Any] = dict.fromkeys(names)
+    if depth_m is None:
+        return record
+    if sample.rectified:
+        by_mask = disparity_scores(sample, depth_m)
+        record["disparity"] = by_mask.pop("all") | {"regions": by_mask}
+    if prediction.uncertainty is not None:
+        record |= _plain({"ause": metrics.ause(depth_m, truth, kept, prediction.uncertainty)})
+    if (confidence := prediction.confidence) is not None:
+        deciles = metrics.confidence_deciles(depth_m, truth, kept, confidence, RIGHT_WITHIN)
+        record["confidence"] = [_plain(decile) for decile in deciles]
+        orders = {"ause": -confidence, "random": None}
+        areas = {name: metrics.ause(depth_m, truth, kept, order) for name, order in orders.items()}
+        record["ause_confidence"] = _plain(areas)
+    if valid.mean() > DENSE:
+        f1 = {"f1": metrics.boundary_f1(depth_m, truth, valid)}
+        record["boundaries"] = _plain(f1 | metrics.boundary_errors(depth_m, truth, valid))
+    return record
+
+
+def in_metres(prediction: Prediction, truth: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """``(H, W)`` metres as they come out; of relative depth, aligned with the truth."""
+    if prediction.depth_m is not None:
+        return prediction.depth_m
+    assert prediction.relative is not None  # a prediction has one of the two
+    return metrics.align(prediction.relative, truth, kept, prediction.space)
+
+
+def score(sample: StereoSample, prediction: Prediction, cap_m: float | None) -> dict[str, Any]:
+    """Every metric of one prediction, as JSON values; ``None`` where it does not apply.
+
+    ``capped`` is without truth from ``cap_m`` metres on, and so are ``regions``. ``ValueError`` for a map of
+    the wrong shape or a sample without truth.
     """
+    truth, valid = sample.depth_m, sample.valid
+    for name in ("depth_m", "relative", "uncertainty", "confidence"):
+        values = getattr(prediction, name)
+        if values is not None and values.shape != truth.shape:
+            bad_value(f"prediction.{name}", f"of the left image's shape {truth.shape}", values.shape)
+    sample.check_truth()
+    values, depth_m, space = prediction.relative, prediction.depth_m, prediction.space
+    if values is None:
+        # Metres are aligned in the prior's own space, as its relative map would be.
+        values = depth_m if space == "depth" else metrics.to_space(_positive(depth_m), space)
+
+    def both(cap: float | None) -> dict[str, Scores | None]:
+        aligned_m = metrics.align(values, truth, metrics.counted(truth, valid, cap), space)
+        raw = None if depth_m is None else _plain(metrics.evaluate_depth(depth_m, truth, valid, cap))
+        return {"raw": raw, "aligned": _plain(metrics.evaluate_depth(aligned_m, truth, valid, cap))}
+
+    record: dict[str, Any] = {"all_pixels": both(None)}
+    record["capped"] = record["all_pixels"] if cap_m is None else both(cap_m)
+    kept = metrics.counted(truth, valid, cap_m)
+    shown_m, errors = in_metres(prediction, truth, kept), {}
+    for name, mask in regions(sample).items():
+        if (mask & kept).any():
+            errors[name] = metrics.evaluate_depth(shown_m, truth, mask & kept, cap_m)["abs_rel"]
+    return record | _metric_scores(sample, prediction, kept) | {"regions": _plain(errors)}
+
+
+def cell_key(ref: SampleRef, method: str, configuration: dict[str, Any], prior: str = "") -> str:
+    """Name of a result: it changes with what is in a sample's files, wherever they lie, and all else."""
     files = {name: value for name, value in ref.files.items() if value is not None}
     return fingerprint(method, configuration, prior, __version__, ref.dataset, ref.name, files)
 
 
 def _measure(
-    ref: SampleRef,
-    read: Callable[[SampleRef], StereoSample],
-    method: Method,
-    settings: Settings,
-    priors: PriorCache,
-    path: Path | None,
+    ref: SampleRef, read: Any, method: Method, settings: Settings, priors: PriorCache, path: Path | None
 ) -> Record:
     """Run one method on one sample and score it; the seconds are those that the method takes alone."""
     sample, process = read(ref), {"process": this_process().index}
@@ -163,11 +303,7 @@ def _has_map(cell: Item, record: Record) -> bool:
 def method_cells(
     refs: Sequence[SampleRef], methods: Sequence[str], settings: Settings, out: Path, save_depth: bool = False
 ) -> list[Item]:
-    """A cell for every method on every sample, all of ``RECORDS_NAME``.
-
-    With ``save_depth`` metres go to ``out/depth/<method>/<dataset>_<sample>.npy``; a record without its map
-    is made again. ``status`` is ``"ok"``, ``"not applicable"`` (``reason``) or ``"broken"`` (``error``).
-    """
+    """A cell for every method on every sample, all of ``RECORDS_NAME``; with ``save_depth`` also maps."""
     # One sample, read once, serves all its methods.
     process, priors, read = this_process(), PriorCache(), lru_cache(maxsize=1)(load)
     several = process.count > 1

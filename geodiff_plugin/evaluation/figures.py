@@ -23,12 +23,11 @@ from geodiff_plugin._checks import check_choice
 from geodiff_plugin.algorithm.terms import masked_mean, photometric_map
 from geodiff_plugin.capture.agreement import DepthFrame, seen_in
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings, find_method
-from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load
+from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load, select
 from geodiff_plugin.evaluation.datasets.sample import changed_ref
-from geodiff_plugin.evaluation.experiment import measure_cells, method_cells, run_facts
+from geodiff_plugin.evaluation.experiment import in_metres, measure_cells, method_cells, run_facts
 from geodiff_plugin.evaluation.metrics import evaluate_depth
-from geodiff_plugin.evaluation.options import FigureOptions, select
-from geodiff_plugin.evaluation.scoring import in_metres
+from geodiff_plugin.evaluation.options import FigureOptions
 from geodiff_plugin.evaluation.tables import ValueOf, count_of_pairs, grouped, headline, mean_with_interval
 from geodiff_plugin.formats import as_image_01, atomic_path
 from geodiff_plugin.formats.out import write_text
@@ -164,9 +163,8 @@ def sweep_g_s(
 ) -> tuple[dict[str, np.ndarray], dict[int, np.ndarray]]:
     """Scale a relative map ``(H, W)``, affine in ``space``, by candidates from 1 m to ``largest_m`` (S7.3).
 
-    Without shift; a map that falls with depth gets that of raw scale and shift 0. ``(M,)`` each: ``g_s_m``
-    metres, ``loss`` (Eq. 14) over the ``visible`` share of pixels (docs/reference/paper-map.md, E8),
-    ``abs_rel``; and by index some left images in [0, 1], re-rendered from the right one.
+    Without shift; a map that falls with depth gets that of raw scale and shift 0. ``loss`` is Eq. 14 over the
+    ``visible`` pixels (docs/reference/paper-map.md, E8); by index some left images, re-rendered.
     """
     left, right = (as_image_01(image, "image")[None] for image in (sample.left, sample.right))
     matrices = (sample.K_left, sample.K_right, np.linalg.inv(sample.E))

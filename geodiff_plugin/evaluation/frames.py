@@ -35,10 +35,9 @@ RIGHT_M, CELL_M = 0.05, 0.02
 
 
 def flicker(errors: Sequence[np.ndarray], truth: Sequence[DepthFrame]) -> tuple[float, float]:
-    """Mean absolute change of log depth of the same surface points from frame to frame, beyond the truth's.
+    """Mean change of log depth of the same surface points from frame to frame, beyond the truth's.
 
-    ``errors`` are ``(H, W)`` each, log of depth over truth. The second number is that of the frames' medians:
-    how far the whole picture breathes.
+    ``errors`` are ``(H, W)`` each, log of depth over truth; the second number is that of the frames' medians.
     """
     points, breath = [], []
     for (frame, following), (before, after) in zip(pairwise(truth), pairwise(errors), strict=True):
@@ -154,10 +153,7 @@ CAPTURE_NOTE = (
 
 
 def f_score(points: np.ndarray, truth: np.ndarray, right_m: float = RIGHT_M) -> float:
-    """Harmonic mean of the shares of ``(N, 3)`` points nearer than ``right_m`` to the other cloud's.
-
-    Source: Knapitsch et al. 2017 (Tanks and Temples), S4.
-    """
+    """F-score of points ``(N, 3)``: within ``right_m`` of the truth's, and back (Tanks and Temples, S4)."""
     if not len(points) or not len(truth):
         return 0.0
     clouds = ((truth, points), (points, truth))
@@ -167,10 +163,7 @@ def f_score(points: np.ndarray, truth: np.ndarray, right_m: float = RIGHT_M) -> 
 
 
 def temporal_error(frames: Sequence[DepthFrame]) -> float:
-    """TAE of frames in order, per cent: depth moved into the next frame's view beside the depth there.
-
-    Source: Chen et al. 2025 (Video Depth Anything), S4.1; both directions, AbsRel over what both see.
-    """
+    """TAE of frames in order, per cent, both directions (Video Depth Anything, Chen et al. 2025, S4.1)."""
     errors = []
     for pair in pairwise(frames):
         for frame, other in (pair, pair[::-1]):

@@ -119,10 +119,9 @@ def ause(pred_m: Map, truth_m: Map, valid: Map, uncertainty: Map | None, steps: 
 def confidence_deciles(
     pred_m: Map, truth_m: Map, valid: Map, confidence: Map, within: float
 ) -> list[dict[str, float | None]]:
-    """What a confidence in [0, 1], that the relative error is below ``within``, promises and what it keeps.
+    """What a confidence that the relative error is below ``within`` promises, and what it keeps, by decile.
 
-    Ten entries, from [0, 0.1) to [0.9, 1]: ``share`` of the pixels, mean ``promised``, ``kept`` (share of
-    pixels within), ``abs_rel``; the last three ``None`` for an empty class.
+    ``share`` of the pixels, mean ``promised``, ``kept``, ``abs_rel``; ``None`` for an empty class.
     """
     used = valid & answered(pred_m)
     error, promised = np.abs(pred_m[used] - truth_m[used]) / truth_m[used], confidence[used]
@@ -247,9 +246,7 @@ def boundary_errors(pred_m: Map, truth_m: Map, valid: Map) -> dict[str, float]:
     """Mean distances, pixels, between the boundaries of a map, its holes filled, and those of the truth.
 
     ``dbe_acc``: of the map's from the truth's, of those nearer than 10; ``dbe_comp``: both ways, at most 10
-    each. NaN where the truth has none, 10 where the map has none. Source: Koch et al., "Evaluation of CNN-
-    based Single-Image Depth Estimation Methods" (iBims-1), S3.2. Deviation: their true boundaries are drawn
-    by hand, ours are found by the same filter.
+    each. Source: Koch et al. 2018 (iBims-1), S3.2. Deviation: their true boundaries are drawn by hand.
     """
     known = answered(pred_m)
     true = _canny(filled(truth_m, valid)) & valid

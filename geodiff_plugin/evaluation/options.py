@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import importlib
-import random
 import shlex
-from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from geodiff_plugin._checks import bad_value
 from geodiff_plugin.options import DTYPES, OUTPUT, SPACES, PriorOptions, check_options, declare, flag_of
 
 if TYPE_CHECKING:
     from geodiff_plugin.evaluation.baselines import Settings
-    from geodiff_plugin.evaluation.datasets import SampleRef
 
 PEERS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
 STRENGTH_METHODS = ("prior-aligned", "prior-fit", "guided", "search-only", "guided:inner_steps=5")
@@ -250,69 +246,3 @@ def command_line(name: str, options: Any) -> str:
             text = ",".join(map(str, entry)) if isinstance(entry, tuple) else str(entry)
             words += flag + ([] if entry is True else [text])
     return shlex.join(words)
-
-
-def data_of(options: Any) -> Path:
-    """Where the samples are: what was given, or the pair that ships with the package."""
-    from geodiff_plugin.bundled import PRIOR_FOLDER
-
-    return options.data or PRIOR_FOLDER.parent / "pair"
-
-
-def all_refs(options: SampleOptions, datasets: Sequence[str] = ()) -> list[SampleRef]:
-    """References to all samples of the data: of the named data sets, else of those that the options name."""
-    from geodiff_plugin.evaluation.datasets import find_pairs
-
-    given = {name: getattr(options, name, None) for name in ("pairs", "pixel_centre")}
-    return find_pairs(data_of(options), datasets or options.datasets or None, **given)
-
-
-def _kept(refs: Sequence[SampleRef], data: Path, scenes: Sequence[str] = ()) -> list[SampleRef]:
-    """The samples whose label contains one of ``scenes``; ``ValueError`` for none, or for two of one name."""
-    kept = [ref for ref in refs if not scenes or any(scene in ref.label for scene in scenes)]
-    if not kept:
-        there = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
-        wanted = f" with {', '.join(scenes)} in its name" if scenes else ""
-        cure = "geodiff eval list says how to obtain the public ones; docs/how-to/extending.md adds others."
-        bad_value("--data", f"a folder with a sample{wanted}", f"{data} with {there}", cure)
-    # As two resolutions of a set have: records could not tell them apart.
-    label, count = Counter(ref.label for ref in kept).most_common(1)[0]
-    if count > 1:
-        cure = "Name the folder of one of them, for instance that of one resolution."
-        bad_value("--data", "a folder with one sample of each name", f"{data} with several {label}", cure)
-    return kept
-
-
-def real_and_rendered(options: RealOptions, kind: str) -> tuple[list[SampleRef], list[SampleRef]]:
-    """The first pairs of ``--data``, and ``--rendered`` ones: ``synthetic`` or ``synthetic-posed``."""
-    from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs
-
-    if options.data is None and not options.rendered:
-        bad_value("--data", "given, or --rendered above 0", "neither")
-    if options.rendered and "synthetic" not in DATASETS:
-        cure = "A clone of the repository has it: python -m tests.scenes eval ..."
-        bad_value("--rendered", "0 where no data set 'synthetic' is registered", options.rendered, cure)
-    real = [] if options.data is None else _kept(find_pairs(options.data), options.data)
-    of_size = f"{kind}:{options.rendered}@{options.width}x{options.width * 3 // 4}"
-    rendered = find_pairs(of_size, ["synthetic"]) if options.rendered else []
-    return real[: options.limit], rendered
-
-
-def select(options: SampleOptions, refs: Sequence[SampleRef] | None = None) -> list[SampleRef]:
-    """Of all samples or ``refs``: those that ``scenes`` names, ``sample`` drawn of them, the first ``limit``.
-
-    Their poses are given wrongly where ``perturb`` says so.
-    """
-    from geodiff_plugin.evaluation.datasets.sample import changed_ref, two_numbers
-
-    kept = _kept(all_refs(options) if refs is None else refs, data_of(options), options.scenes)
-    count = getattr(options, "sample", None)
-    if count is not None:
-        if count > len(kept):
-            bad_value("--sample", f"at most {len(kept)}, the number of samples found", count)
-        drawn = random.Random(options.seed).sample(range(len(kept)), count)
-        kept = [kept[i] for i in sorted(drawn)]
-    kept = kept[: options.limit]
-    if options.perturb is None:
-        return kept
-    return [changed_ref(ref, "perturbed", two_numbers(options.perturb, "--perturb")) for ref in kept]

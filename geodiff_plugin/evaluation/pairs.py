@@ -1,7 +1,4 @@
-"""Methods side by side on pairs: ``geodiff eval pairs``, ``parts``, ``flatness`` and ``cost``.
-
-Paper: S5.3, which the changes of a preset extend, and S9 for the cost.
-"""
+"""Methods side by side on pairs: ``geodiff eval pairs``, ``parts``, ``flatness`` and ``cost`` (S5.3, S9)."""
 
 from __future__ import annotations
 
@@ -17,9 +14,9 @@ from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.config import DEFAULT, value_of
 from geodiff_plugin.evaluation import experiment, tables
 from geodiff_plugin.evaluation.baselines import find_method
-from geodiff_plugin.evaluation.datasets import SampleRef
+from geodiff_plugin.evaluation.datasets import SampleRef, select
 from geodiff_plugin.evaluation.experiment import Page
-from geodiff_plugin.evaluation.options import PairsOptions, select
+from geodiff_plugin.evaluation.options import PairsOptions
 from geodiff_plugin.evaluation.tables import Table, cell, count_of_pairs, mean_cell, pairs_of
 from geodiff_plugin.priors import PRIORS, find_prior
 from geodiff_plugin.runner import Item, Record, this_process
@@ -169,10 +166,7 @@ def flatness_table(records: Sequence[Record]) -> Table:
 
 
 def run_changes(name: str, options: PairsOptions) -> Page | None:
-    """Change one thing of the default at a time: its ``parts``, or the numbers of ``flatness``.
-
-    ``options.methods`` are run beside the table's own; errors as ``run_experiment``.
-    """
+    """Change one thing of the default at a time: its ``parts``, or the numbers of ``flatness``."""
     flat, refs = name == "flatness", select(options)
     methods = FLATNESS if flat else tuple(method for _, method in CHANGES[name])
 

@@ -1,7 +1,4 @@
-"""The paper's tables 1 to 4 as runs, in its layout, with its published numbers beside a full data set.
-
-Paper: Table 1 (tab:depth_comparison), 2 (tab:stereo_comparison), 3 (tab:two_views), 4 (tab:ablation_study).
-"""
+"""The paper's tables 1 to 4 as runs, in its layout, with its published numbers beside a full data set."""
 
 from __future__ import annotations
 
@@ -12,9 +9,9 @@ from typing import NamedTuple
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation import tables
 from geodiff_plugin.evaluation.baselines import find_method
-from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef
+from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, all_refs, select
 from geodiff_plugin.evaluation.experiment import Page
-from geodiff_plugin.evaluation.options import PairsOptions, all_refs, select
+from geodiff_plugin.evaluation.options import PairsOptions
 from geodiff_plugin.evaluation.pairs import CHANGES, changes_table, compare
 from geodiff_plugin.evaluation.tables import Table, count_of_pairs
 from geodiff_plugin.runner import Record
@@ -44,10 +41,7 @@ class Column(NamedTuple):
 
 
 class PaperRow(NamedTuple):
-    """One row of a table, ``published`` by the column's title.
-
-    A ``method`` such as ``files:DIR/unidepth`` stands for every one that has ``unidepth`` after its colon.
-    """
+    """One row of a table; files:DIR/unidepth stands for every method with that word after its colon."""
 
     title: str
     aligned: bool

@@ -1,8 +1,7 @@
 """Guidance of priors from exact to weak: ``geodiff eval strength``, with emulated priors of chosen error.
 
-The pipeline, its scheduler and its autoencoder are real. The emulated network's clean estimate is
-``(1 - follow) z0* + follow z0(z_t)``: ``z0*`` is the code of the erroneous truth, and ``z0(z_t)`` what its
-input says, so that an edit of one step is seen by the next one, as a trained network would see it.
+Only the network is emulated: it answers ``(1 - follow) z0* + follow z0(z_t)``, ``z0*`` the code of the
+erroneous truth, ``z0(z_t)`` what its input says, so that an edit of one step is seen by the next one.
 """
 
 from __future__ import annotations
@@ -25,11 +24,10 @@ from geodiff_plugin.algorithm.denoising import output_from
 from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.evaluation import tables
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Settings, find_method
-from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, find_pairs, load
-from geodiff_plugin.evaluation.experiment import Page, cell_key, run_experiment
+from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, data_of, find_pairs, load
+from geodiff_plugin.evaluation.experiment import DENSE, Page, cell_key, in_metres, run_experiment
 from geodiff_plugin.evaluation.metrics import edge_error, evaluate_depth, filled, surface_error, to_space
-from geodiff_plugin.evaluation.options import STRENGTHS, StrengthOptions, data_of
-from geodiff_plugin.evaluation.scoring import DENSE, in_metres
+from geodiff_plugin.evaluation.options import STRENGTHS, StrengthOptions
 from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, method_title, most_of
 from geodiff_plugin.priors import prior_of
 from geodiff_plugin.runner import Item, Record
@@ -61,10 +59,7 @@ Strength = tuple[float, bool, float]  # a value of ``STRENGTHS``
 
 
 def relative_map(sample: StereoSample, strength: Strength, space: str, seed: int = 0) -> np.ndarray:
-    """``(H, W)`` float64, the map of a prior that errs in a given way, the same error in every space.
-
-    0 and 1 are at the quantiles ``ENDS``, where it is clipped as trained maps are.
-    """
+    """``(H, W)`` float64 in [0, 1], the map of a prior that errs in a given way, alike in every space."""
     log_depth = np.log(filled(sample.depth_m, sample.valid))
     rng = np.random.default_rng([seed, 47])
     error, blur, gamma = strength

@@ -25,8 +25,8 @@ from geodiff_plugin.evaluation.baselines.guided import call_arguments, posed_vie
 from geodiff_plugin.evaluation.baselines.unguided import sweep
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
+from geodiff_plugin.evaluation.experiment import DENSE
 from geodiff_plugin.evaluation.options import STRENGTHS
-from geodiff_plugin.evaluation.scoring import DENSE
 from geodiff_plugin.evaluation.strength import EmulatedPrior
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.matching import consistency

@@ -16,8 +16,7 @@ from geodiff_plugin.evaluation.baselines import Prediction
 from geodiff_plugin.evaluation.datasets import DATASETS, StereoSample, find_pairs, load
 from geodiff_plugin.evaluation.datasets.layouts import KEY_VIEWS
 from geodiff_plugin.evaluation.datasets.sample import changed_ref, depth_to_disparity, disparity_to_depth
-from geodiff_plugin.evaluation.experiment import cell_key
-from geodiff_plugin.evaluation.scoring import score
+from geodiff_plugin.evaluation.experiment import cell_key, score
 from geodiff_plugin.formats import as_image_01, write_pfm
 from geodiff_plugin.geometry import warp_right_to_left
 from tests.contracts.calibrations import SAMPLES

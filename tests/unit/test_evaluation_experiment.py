@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geodiff_plugin.evaluation import experiment, scoring
+from geodiff_plugin.evaluation import experiment
 from geodiff_plugin.evaluation.baselines import (
     Method,
     NotApplicable,
@@ -17,8 +17,7 @@ from geodiff_plugin.evaluation.baselines import (
 from geodiff_plugin.evaluation.baselines.unguided import sweep
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample
 from geodiff_plugin.evaluation.datasets.sample import with_perturbed_poses
-from geodiff_plugin.evaluation.experiment import RECORDS_NAME, cell_key
-from geodiff_plugin.evaluation.scoring import matched, out_of_view, regions, score
+from geodiff_plugin.evaluation.experiment import RECORDS_NAME, cell_key, matched, out_of_view, regions, score
 from geodiff_plugin.evaluation.tables import (
     DETAILS,
     details_table,
@@ -87,7 +86,7 @@ def test_poses_given_wrongly_change_no_mask_and_no_true_disparity(monkeypatch):
     np.testing.assert_array_equal(out_of_view(wrong), out_of_view(sample))
     double = Prediction(2 * sample.depth_m)
     assert score(wrong, double, None)["disparity"] == score(sample, double, None)["disparity"]
-    monkeypatch.setattr(scoring, "sweep", lambda sample, _: swept.append(sample.E) or sweep(sample, "cpu"))
+    monkeypatch.setattr(experiment, "sweep", lambda sample, _: swept.append(sample.E) or sweep(sample, "cpu"))
     assert matched(with_perturbed_poses(sample, (20.0, 0.5), "b")) is None  # too small an image
     np.testing.assert_array_equal(swept[0], sample.E)
 
@@ -120,7 +119,7 @@ def test_regions_split_what_the_right_camera_sees_and_tables_show_them():
 def test_regions_split_by_whether_the_views_match_which_is_found_once_a_sample(monkeypatch):
     swept, valid = [], np.ones((64, 128), bool)
     valid[:8] = False
-    monkeypatch.setattr(scoring, "sweep", lambda sample, device: swept.append(1) or sweep(sample, device))
+    monkeypatch.setattr(experiment, "sweep", lambda sample, device: swept.append(1) or sweep(sample, device))
     sample = textured_sample(valid=valid)
     for factor in (1, 2):
         score(sample, Prediction(factor * sample.depth_m), None)

@@ -12,7 +12,7 @@ from PIL import Image
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.baselines.unguided import sgbm_shift
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample, make_sample
-from geodiff_plugin.evaluation.scoring import score
+from geodiff_plugin.evaluation.experiment import score
 from geodiff_plugin.formats import write_depth_mm, write_pfm
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.types import Rig

@@ -36,11 +36,7 @@ FAMILIES: dict[str, Callable[[str], Method]] = {
 
 
 def find_method(name: str) -> Method:
-    """The method of a name: a key of ``METHODS``, or ``family:parameter`` with a key of ``FAMILIES``.
-
-    One that uses a prior may be bound to another, to another seed, or to both, as in ``guided@org/prior#3``.
-    ``ValueError`` for what there is not, and for what cannot be bound.
-    """
+    """The method of a name, as ``guided``, ``hf:MODEL``, ``guided@org/prior#3``; else ``ValueError``."""
     if name in METHODS:
         return METHODS[name]
     family, colon, parameter = name.partition(":")

@@ -22,7 +22,7 @@ from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.priors import load_prior, prior_of
 from geodiff_plugin.priors.components import DirectScheduler
-from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
+from geodiff_plugin.priors.map import DepthMapPipeline
 from geodiff_plugin.runner import fingerprint
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.scale.space import SPACES
@@ -41,10 +41,7 @@ class NotApplicable(Exception):
 
 @dataclass(frozen=True)
 class Settings:
-    """What the user chose for a run, the same for every method; ``None`` is the pipeline's own.
-
-    ``resolution`` is the longer side, pixels; at most ``views`` views of a sample are taken.
-    """
+    """What the user chose for a run, the same for every method; ``None`` is the pipeline's own."""
 
     prior: str = "bundled"
     ensemble: int = 1
@@ -59,11 +56,9 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """One method's answer for one sample, ``(H, W)`` each at the left image's resolution.
+    """One method's answer at the left image's resolution: metres, or ``relative``, affine in ``space``.
 
-    ``depth_m`` metres, not finite in holes, or ``relative``, affine in ``space``, in which an oracle aligns
-    it; perhaps ``uncertainty``, larger is less certain, and ``confidence`` in [0, 1]. ``notes`` are JSON
-    values.
+    Holes are not finite; larger ``uncertainty`` is less certain; ``confidence`` is in [0, 1].
     """
 
     depth_m: np.ndarray | None
@@ -240,12 +235,7 @@ def _run_plain(sample: StereoSample, settings: Settings, priors: PriorCache) -> 
 
 
 def guided_map(
-    values: np.ndarray,
-    space: str,
-    sample: StereoSample,
-    settings: Settings,
-    priors: PriorCache,
-    preset: Preset = GeometryGuidance,
+    values: Any, space: str, sample: StereoSample, settings: Settings, priors: PriorCache, preset: Preset
 ) -> Prediction:
     """A map ``(h, w)``, affine in ``space`` and not finite in holes, as the prior that a preset guides."""
     pipe = priors.get(replace(settings, prior="map", space=space))
@@ -269,36 +259,17 @@ def _run_reprojection(sample: StereoSample, settings: Settings, priors: PriorCac
     return guided_map(relative, prior_of(pipe).space, sample, settings, priors, _photometric_updates)
 
 
-class RampPrior(DepthDiffusionPipeline):
+class RampPrior(DepthMapPipeline):
     """One step to the latent of a ground plane, near at the bottom, by the ``adapter`` of another prior."""
 
-    max_steps, deterministic, sees_latents = 1, True, False
     adapter: Any
 
-    def __init__(
-        self,
-        module: torch.nn.Module,
-        scheduler: Any,
-        prediction_type: str = "depth",
-        default_denoising_steps: int = 1,
-        default_processing_resolution: int = 0,
-    ) -> None:
-        super().__init__()
-        modules = {"module": module, "scheduler": scheduler}
-        self.register_prior(modules, prediction_type, default_denoising_steps, default_processing_resolution)
-
-    def prepare_condition(
-        self, image: Tensor, ensemble_size: int, batch_size: int, generator: Any, **options: Any
-    ) -> dict[str, Tensor]:
+    def prepare_condition(self, image: Tensor, ensemble_size: int, *_: Any, **__: Any) -> dict[str, Tensor]:
         """The ramp's latent, which is all that there is."""
         near, far = (0.0, 1.0) if SPACES[self.adapter.space].grows_with_depth else (1.0, 0.0)
         rows = torch.linspace(far, near, image.shape[-2], device=image.device).view(1, 1, -1, 1)
         ramp = rows.expand(len(image), 1, -1, image.shape[-1])
         return {"image_latent": self.adapter.encode(ramp)}
-
-    def denoise(self, latents: Tensor, timestep: Tensor, condition: dict[str, Tensor]) -> Tensor:
-        """The ramp's latent, whatever the latents."""
-        return condition["image_latent"]
 
     def decode(self, z0: Tensor) -> Tensor:
         """By the prior's decoder."""
@@ -314,11 +285,9 @@ def _run_ramp(preset: Preset, sample: StereoSample, settings: Settings, priors: 
     pipe = priors.get(settings)
     adapter, asked = prior_of(pipe), preset(*posed_views(sample, settings.views))
     rounds = asked.denoising_steps(settings.steps, pipe.default_denoising_steps)
-    module = next(part for part in pipe.components.values() if isinstance(part, torch.nn.Module))
-    size = pipe.default_processing_resolution or 0
-    ramp = RampPrior(module, DirectScheduler(), adapter.space, rounds, size)
+    ramp = RampPrior(DirectScheduler(), adapter.space, rounds, pipe.default_processing_resolution or 0)
     ramp.adapter, ramp.image_processor = adapter, pipe.image_processor
-    ramp.set_progress_bar_config(disable=True)
+    ramp.to(pipe.device).set_progress_bar_config(disable=True)
     guidance = _guidance(sample, settings, priors, preset, min_steps=rounds)
     arguments = {} if settings.resolution is None else {"processing_resolution": settings.resolution}
     return guided_prediction(enable_geometry_guidance(ramp), sample, guidance, arguments)

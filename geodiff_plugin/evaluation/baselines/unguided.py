@@ -176,15 +176,11 @@ def _prediction(values: np.ndarray, sample: StereoSample, kind: str) -> Predicti
 
 
 def files_method(text: str, guided: bool = False) -> Method:
-    """Maps that were made elsewhere, in a folder: DIR or KIND:DIR.
-
-    The map of a sample is ``DIR/<dataset>_<sample>`` with the suffix .npy, .pfm or .png (16 bit), of any
-    size. ``guided``: the maps are the prior of the default preset.
-    """
+    """Maps that were made elsewhere, in a folder: DIR or KIND:DIR; ``guided``: as a prior."""
     kind, colon, named = text.partition(":")
     if not (colon and kind in KINDS):
         kind, named = "depth", text
-    folder = Path(named)
+    folder, space = Path(named), kind.removeprefix("relative-")
     if not named or not os.path.isdir(folder):
         cure = f"KIND is one of {', '.join(KINDS)}."
         bad_value("methods", "files:DIR or files:KIND:DIR with an existing folder", repr(text), cure)
@@ -196,7 +192,7 @@ def files_method(text: str, guided: bool = False) -> Method:
             raise NotApplicable("no map in the folder")
         values = _read(path, kind)
         if guided:
-            return guided_map(values, kind.removeprefix("relative-"), sample, settings, priors)
+            return guided_map(values, space, sample, settings, priors, GeometryGuidance)
         return _prediction(values, sample, kind)
 
     def configuration(settings: Settings) -> dict[str, Any]:

@@ -1,14 +1,26 @@
-"""Data sets in their official layouts (paper S5.1, Tables 1 to 3), and one table of them."""
+"""Data sets in their official layouts (paper S5.1), and which of their samples a command takes."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+import random
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.bundled import PRIOR_FOLDER
 from geodiff_plugin.evaluation.datasets.layouts import LAYOUTS
-from geodiff_plugin.evaluation.datasets.sample import CHANGES, Dataset, SampleRef, StereoSample
+from geodiff_plugin.evaluation.datasets.sample import (
+    CHANGES,
+    Dataset,
+    SampleRef,
+    StereoSample,
+    changed_ref,
+    two_numbers,
+)
+from geodiff_plugin.evaluation.options import RealOptions, SampleOptions
 
 __all__ = ["DATASETS", "Dataset", "SampleRef", "StereoSample", "find_pairs", "load"]
 
@@ -26,11 +38,7 @@ def load(ref: SampleRef) -> StereoSample:
 
 
 def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **options: object) -> list[SampleRef]:
-    """References to every metric pair of the ``datasets``, all by default, below ``root``, in their order.
-
-    ``options`` are for the sets that know them (``pairs``, ``pixel_centre``); ``None`` is their default.
-    ``ValueError`` where ``root`` is no folder, or for a name that is not in ``DATASETS``.
-    """
+    """References to every metric pair of the ``datasets`` below ``root``; ``options`` are for some sets."""
     root = Path(root)
     refs = []
     for name in DATASETS if datasets is None else datasets:
@@ -42,3 +50,58 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **option
     if not refs and not os.path.isdir(root):
         bad_value("root", "an existing folder", str(root))
     return refs
+
+
+def data_of(options: Any) -> Path:
+    """Where the samples are: what was given, or the pair that ships with the package."""
+    return options.data or PRIOR_FOLDER.parent / "pair"
+
+
+def all_refs(options: SampleOptions, datasets: Sequence[str] = ()) -> list[SampleRef]:
+    """References to all samples of the data: of the named data sets, else of those that the options name."""
+    given = {name: getattr(options, name, None) for name in ("pairs", "pixel_centre")}
+    return find_pairs(data_of(options), datasets or options.datasets or None, **given)
+
+
+def _kept(refs: Sequence[SampleRef], data: Path, scenes: Sequence[str] = ()) -> list[SampleRef]:
+    """The samples whose label contains one of ``scenes``; ``ValueError`` for none, or for two of one name."""
+    kept = [ref for ref in refs if not scenes or any(scene in ref.label for scene in scenes)]
+    if not kept:
+        there = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
+        wanted = f" with {', '.join(scenes)} in its name" if scenes else ""
+        cure = "geodiff eval list says how to obtain the public ones; docs/how-to/extending.md adds others."
+        bad_value("--data", f"a folder with a sample{wanted}", f"{data} with {there}", cure)
+    # As two resolutions of a set have: records could not tell them apart.
+    label, count = Counter(ref.label for ref in kept).most_common(1)[0]
+    if count > 1:
+        cure = "Name the folder of one of them, for instance that of one resolution."
+        bad_value("--data", "a folder with one sample of each name", f"{data} with several {label}", cure)
+    return kept
+
+
+def real_and_rendered(options: RealOptions, kind: str) -> tuple[list[SampleRef], list[SampleRef]]:
+    """The first pairs of ``--data``, and ``--rendered`` ones: ``synthetic`` or ``synthetic-posed``."""
+    if options.data is None and not options.rendered:
+        bad_value("--data", "given, or --rendered above 0", "neither")
+    if options.rendered and "synthetic" not in DATASETS:
+        cure = "A clone of the repository has it: python -m tests.scenes eval ..."
+        bad_value("--rendered", "0 where no data set 'synthetic' is registered", options.rendered, cure)
+    real = [] if options.data is None else _kept(find_pairs(options.data), options.data)
+    of_size = f"{kind}:{options.rendered}@{options.width}x{options.width * 3 // 4}"
+    rendered = find_pairs(of_size, ["synthetic"]) if options.rendered else []
+    return real[: options.limit], rendered
+
+
+def select(options: SampleOptions, refs: Sequence[SampleRef] | None = None) -> list[SampleRef]:
+    """The samples that ``scenes`` names, ``sample`` drawn of them, the first ``limit``, some perturbed."""
+    kept = _kept(all_refs(options) if refs is None else refs, data_of(options), options.scenes)
+    count = getattr(options, "sample", None)
+    if count is not None:
+        if count > len(kept):
+            bad_value("--sample", f"at most {len(kept)}, the number of samples found", count)
+        drawn = random.Random(options.seed).sample(range(len(kept)), count)
+        kept = [kept[i] for i in sorted(drawn)]
+    kept = kept[: options.limit]
+    if options.perturb is None:
+        return kept
+    return [changed_ref(ref, "perturbed", two_numbers(options.perturb, "--perturb")) for ref in kept]

@@ -1,7 +1,4 @@
-"""Readers of data sets in their official layouts, and of the user's own folders (S5.1, Tables 1 to 3).
-
-Depth of a rectified pair is ``f b / (d + doffs)`` in metres, with doffs in pixels.
-"""
+"""Readers of data sets in their official layouts, and of the user's own folders (S5.1, Tables 1 to 3)."""
 
 from __future__ import annotations
 
@@ -126,10 +123,7 @@ _TESTS = ("testF", "testH", "testQ", "two_view_test")
 
 
 def _find_scenes(root: Path, name: str) -> list[SampleRef]:
-    """Folders of one of the three sets in Middlebury's format, but test scenes without truth.
-
-    The set follows from the folder's name (``eth3d``, ``two_view``), else from the truth's.
-    """
+    """Folders in Middlebury's format of the set that a folder's name, else the truth's, says; with truth."""
     refs = []
     for folder in _folders(root, 3):
         if not ((folder / "im0.png").is_file() and (folder / "calib.txt").is_file()):
@@ -199,11 +193,7 @@ def _quartered(image: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _load_booster(ref: SampleRef) -> StereoSample:
-    """Read one pair at a quarter of its size; the disparity is in pixels of the full size, 0 = unknown.
-
-    Masks, where the scene has them: ``occluded``, 0 where hidden, and ``material``: class 0 the least, 3 the
-    most specular or transparent.
-    """
+    """Read one pair at a quarter of its size; where there are masks, ``occluded`` is 0 for hidden."""
     files = ref.files
     (left, right), rig = _read_pair(ref)
     if any(side % SHRINK for side in (*left.shape[:2], *right.shape[:2])):
@@ -259,11 +249,9 @@ def _posed_views(group: Path, every: bool, benchmark: bool) -> list[list[int]]:
 
 
 def _find_posed(root: Path, name: str, pairs: str = "default", pixel_centre: float = 0.0) -> list[SampleRef]:
-    """Groups with ``images``, ``cams`` and ``pair.txt``, down to two levels.
+    """Groups with ``images``, ``cams`` and ``pair.txt``; one pair of each, or of each key view.
 
-    Of ``robustmvd`` every key view with its best source, of others the first two views of each group; with
-    ``pairs="all"`` every listed pair. ``pixel_centre`` is the coordinate of the top-left pixel's centre in
-    the cameras' convention. The truth of ``mvsnet`` is our addition to the layout.
+    ``pairs="all"``: every listed pair. ``pixel_centre`` is the coordinate of the top-left pixel's centre.
     """
     check_choice(pairs, "pairs", ("default", "all"))
     refs, every, benchmark = [], pairs == "all", name == "robustmvd"
@@ -289,10 +277,7 @@ def _find_posed(root: Path, name: str, pairs: str = "default", pixel_centre: flo
 
 
 def _load_posed(ref: SampleRef) -> StereoSample:
-    """Read one posed pair; the camera files' depth numbers are never used.
-
-    Without a truth ``valid`` is False everywhere, but for the benchmark, whose truth must be there.
-    """
+    """Read one posed pair, whose truth may be missing; the camera files' depth numbers are never used."""
     (images, rig), files = _read_pair(ref), ref.files
     truth, half, extra = files["truth"], np.zeros((3, 3)), []
     half[:2, 2] = files["pixel_centre"]
@@ -320,11 +305,7 @@ def _image(folder: Path, stem: str) -> Path | None:
 
 
 def _find_folders(root: Path, name: str) -> list[SampleRef]:
-    """``root`` and the folders right below it with at least two of ``left.*``, ``right.*`` and ``calib.*``.
-
-    Reading the pair names the third file. The calibration is one file, or ``calib_left.*`` and
-    ``calib_right.*``.
-    """
+    """``root`` and the folders right below it with two of left, right and calib; reading names the third."""
     refs = []
     for folder in _folders(root, 1):
         left, right = _image(folder, "left"), _image(folder, "right")

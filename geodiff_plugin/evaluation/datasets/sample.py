@@ -6,7 +6,6 @@ import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -135,9 +134,8 @@ def make_sample(
 ) -> StereoSample:
     """The sample of a reference, once its files are read.
 
-    ``images`` are ``(H, W, 3)`` uint8 each, left and right; ``rig`` is that of the images as handed over;
-    ``depth_m`` is ``(H, W)`` metres, unknown where not a positive number; ``masks`` are ``occluded``,
-    ``material`` and ``extra_views`` of ``StereoSample``.
+    ``images`` are ``(H, W, 3)`` uint8 each, left and right, and ``rig`` is theirs; ``depth_m`` is ``(H, W)``
+    metres, unknown where not positive; ``masks`` are ``occluded``, ``material`` and ``extra_views``.
     """
     valid = np.isfinite(depth_m) & (depth_m > 0)
     cameras = (torch.as_tensor(matrix) for matrix in (rig.K_left, rig.K_right, rig.T_right_from_left))
@@ -180,10 +178,7 @@ def with_exposure(sample: StereoSample, change: Sequence[float], name: str) -> S
 
 
 def with_drifted_rig(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
-    """The right camera has turned, by degrees, and its image moved, by pixels, since the rig was calibrated.
-
-    Both are a homography, whatever the depth; the name draws axis and sign.
-    """
+    """The right camera has turned and its image moved, a homography; the name draws axis and sign."""
     degrees, px = change
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     axis = rng.normal(size=3)
@@ -196,31 +191,28 @@ def with_drifted_rig(sample: StereoSample, change: Sequence[float], name: str) -
     return replace(sample, name=name, right=right)
 
 
-def perturbed_pose(E: Array, degrees: float, share: float, depth_m: float, rng: np.random.Generator) -> Array:
-    """A pose off by at most ``degrees`` and that ``share`` of the baseline, which stays as long.
+def with_perturbed_poses(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
+    """Give the poses of the right views wrongly, by at most degrees and that share of the baseline.
 
     Every second error is of a tracker's kind: its shift makes up for its turn at the scene's depth.
     """
-    axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-    turn = axis * np.radians(degrees) * rng.uniform(LEAST, 1.0)
-    baseline = float(np.linalg.norm(E[:3, 3]))
-    shift = way * share * baseline * rng.uniform(LEAST, 1.0)
-    if rng.random() < 0.5:
-        shift = -np.cross(turn, (0.0, 0.0, depth_m))
-        shift *= min(1.0, share * baseline / max(float(np.linalg.norm(shift)), 1e-12))
-    wrong = E.copy()
-    wrong[:3, :3] = E[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
-    moved = E[:3, 3] + E[:3, :3] @ shift
-    wrong[:3, 3] = moved * baseline / np.linalg.norm(moved)
-    return wrong
-
-
-def with_perturbed_poses(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
-    """Give the poses of the right views wrongly, by at most degrees and a share of the baseline."""
     sample.check_truth()
-    rng = np.random.default_rng(zlib.crc32(name.encode()))
-    depth_m, (degrees, share) = float(np.median(sample.depth_m[sample.valid])), change
-    wrong = partial(perturbed_pose, degrees=degrees, share=share, depth_m=depth_m, rng=rng)
+    rng, (degrees, share) = np.random.default_rng(zlib.crc32(name.encode())), change
+    depth_m = float(np.median(sample.depth_m[sample.valid]))
+
+    def wrong(E: Array) -> Array:
+        axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+        turn = axis * np.radians(degrees) * rng.uniform(LEAST, 1.0)
+        baseline = float(np.linalg.norm(E[:3, 3]))
+        shift = way * share * baseline * rng.uniform(LEAST, 1.0)
+        if rng.random() < 0.5:
+            shift = -np.cross(turn, (0.0, 0.0, depth_m))
+            shift *= min(1.0, share * baseline / max(float(np.linalg.norm(shift)), 1e-12))
+        given, moved = E.copy(), E[:3, 3] + E[:3, :3] @ shift
+        given[:3, :3] = E[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
+        given[:3, 3] = moved * baseline / np.linalg.norm(moved)
+        return given
+
     E, extra = wrong(sample.E), tuple((image, K, wrong(other)) for image, K, other in sample.extra_views)
     return replace(sample, name=name, E=E, E_true=sample.E_scored, extra_views=extra)
 
