@@ -21,14 +21,14 @@ import numpy as np
 import torch
 
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior, read_calibration
-from geodiff_plugin.formats.recordings import VideoReader, count_frames
+from geodiff_plugin.formats.recordings import VideoReader, video_facts
 from geodiff_plugin.plotting import depth_frames, write_depth_video
 from tests.scenes.sequences import render_sequence
 
 
 def read_frames(left: Path, right: Path, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """The first frames of both videos, ``(H, W, 3)`` in [0, 1] each; as many as both have, at most."""
-    count = min(count, count_frames(left), count_frames(right))
+    count = min(count, video_facts(left)[0], video_facts(right)[0])
     with VideoReader(left) as lefts, VideoReader(right) as rights:
         for i in range(count):
             yield lefts.read(i), rights.read(i)

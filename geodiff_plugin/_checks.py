@@ -37,13 +37,16 @@ def quoted(got: object) -> str:
     return text if len(text) <= LONGEST_GOT else f"{text[:LONGEST_GOT]}..."
 
 
-def _sentence(name: str, expected: str, got: object, cure: str) -> str:
-    return f"{name} must be {expected}; got {quoted(got)}." + (f" {cure}" if cure else "")
+def bad_value(
+    name: str, expected: str, got: object, cure: str = "", error: type[InputError] = InputError
+) -> NoReturn:
+    """Raise ``<name> must be <expected>; got <got>. <cure>``."""
+    raise error(f"{name} must be {expected}; got {quoted(got)}." + (f" {cure}" if cure else ""))
 
 
-def bad_value(name: str, expected: str, got: object, cure: str = "") -> NoReturn:
-    """Raise ``InputError``: ``<name> must be <expected>; got <got>. <cure>``."""
-    raise InputError(_sentence(name, expected, got, cure))
+def bad_type(name: str, expected: str, got: object, cure: str = "") -> NoReturn:
+    """Raise ``InputTypeError`` with the same sentence, naming the type of the value."""
+    bad_value(name, expected, type(got).__name__, cure, InputTypeError)
 
 
 def refuse(sentences: str) -> NoReturn:
@@ -51,17 +54,8 @@ def refuse(sentences: str) -> NoReturn:
     raise InputError(sentences)
 
 
-def bad_type(name: str, expected: str, got: object, cure: str = "") -> NoReturn:
-    """Raise ``InputTypeError`` with the same sentence, naming the type of the value."""
-    raise InputTypeError(_sentence(name, expected, f"{type(got).__name__}", cure))
-
-
 def warn(sentence: str, *, doubt: bool = False, stacklevel: int = 2) -> None:
-    """Warn, and tell the ``noted`` block that this runs in.
-
-    A result with a ``doubt`` is not to be trusted. ``stacklevel`` is that of ``warnings.warn``, from the
-    caller.
-    """
+    """Warn, and tell the ``noted`` block around; a result with a ``doubt`` is not to be trusted."""
     warned = _NOTED.get()
     if warned is not None:
         warned[sentence] = warned.get(sentence, False) or doubt
@@ -82,11 +76,15 @@ def noted() -> Iterator[dict[str, bool]]:
             outer.update(warned)
 
 
-def check_number(value: Any, name: str, low: float, high: float, *, integer: bool = False) -> Any:
-    """A finite number in ``[low, high]``, returned as it came."""
+def _check_kind(value: Any, name: str, integer: bool) -> None:
     kind: Any = Integral if integer else Real
     if isinstance(value, bool) or not isinstance(value, kind):
         bad_type(name, "an integer" if integer else "a number", value)
+
+
+def check_number(value: Any, name: str, low: float, high: float, *, integer: bool = False) -> Any:
+    """A finite number in ``[low, high]``, returned as it came."""
+    _check_kind(value, name, integer)
     # Whole numbers may be longer than any float: compared, not converted. NaN is not within anything.
     if not low <= value <= high or value in (float("inf"), float("-inf")):
         endless = isinstance(value, int) and value.bit_length() > 128
@@ -97,9 +95,7 @@ def check_number(value: Any, name: str, low: float, high: float, *, integer: boo
 
 def check_positive(value: Any, name: str, unit: str) -> Any:
     """A finite number above 0, returned as it came."""
-    kind: Any = Real
-    if isinstance(value, bool) or not isinstance(value, kind):
-        bad_type(name, "a number", value)
+    _check_kind(value, name, False)
     if not 0 < value < float("inf"):
         bad_value(name, f"a finite number of {unit} above 0", value)
     return value

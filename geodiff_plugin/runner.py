@@ -1,17 +1,10 @@
 """One resumable loop for long jobs: ``geodiff depth`` over many pairs, captures and the evaluation.
 
-A job is a list of ``Item``; its results are lines of a ``Journal``, a JSONL file. ``Runner.run`` takes every
-item without a result through the stages of the work and appends one record each::
-
-    items = [Item(fingerprint(name, settings, path, __version__), path) for ...]
-    runner = Runner(items, Journal(out / "samples.jsonl"), noun="sample")
-    records = runner.run(lambda item: {"abs_rel": measure(item.payload)})
-
-Several processes, started by ``torchrun``, ``accelerate launch`` or in two terminals, share a job by sharing
-its journal. Each claims an item before the work, with a lock that the kernel gives back when the process
-ends, however it ends. The first process waits for what others have claimed, takes it over should they die,
-and returns the records of all; the others leave when nothing is left to claim. Failures are records too
-(``status`` ``"broken"``, ``error``), tried again by the next run. Nothing here imports torch.
+A ``Runner`` takes every ``Item`` without a result through the stages of the work and appends its record to a
+``Journal``, a JSONL file. Several processes (``torchrun``, or two terminals) share a job by its journal: each
+claims an item with a lock that the kernel gives back when the process ends, however it ends. The first waits
+for what others have claimed, takes it over should they die, and returns the records of all. Failures are
+records too, tried again by the next run. Nothing here imports torch.
 """
 
 from __future__ import annotations
@@ -31,12 +24,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.formats.files import file_digest
+from geodiff_plugin.formats.out import unwritable
 
 try:
     import fcntl
@@ -55,10 +49,7 @@ MOST_NAMES = 5
 
 
 def fingerprint(*parts: Any) -> str:
-    """20 hexadecimal digits that name inputs: the same inputs give the same, any other ones another.
-
-    They are JSON values, also nested; a ``Path`` counts by what the file holds, not by where it lies.
-    """
+    """20 hexadecimal digits that name inputs: JSON values, and paths, which count by what the file holds."""
     text = json.dumps([_readable(part) for part in parts], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:20]
 
@@ -74,8 +65,7 @@ def _readable(part: Any) -> Any:
     return [_readable(value) for value in part] if isinstance(part, (list, tuple)) else part
 
 
-@dataclass(frozen=True)
-class Process:
+class Process(NamedTuple):
     """Which of how many processes of a launcher this one is, from 0, and its index on its own machine."""
 
     index: int
@@ -91,11 +81,10 @@ def this_process() -> Process:
 
 @dataclass(frozen=True, eq=False)
 class Item:
-    """One piece of work; a record of the same ``key`` and ``inputs`` says that it is done.
+    """One piece of work; a record of the same ``key`` and ``inputs`` (a fingerprint) says that it is done.
 
-    The first stage works on ``payload``. ``inputs`` is the fingerprint of what it is made from, unless the
-    key is it. ``head`` begins its record, also where it fails. ``words`` are texts of this item alone, such
-    as its paths, which are no part of the cause of a failure; its label where there are none.
+    The first stage works on ``payload``. ``head`` begins its record, also where it fails. ``words`` are texts
+    of this item alone, such as its paths, which are no part of the cause of a failure; else its label.
     """
 
     key: str
@@ -112,11 +101,10 @@ class Item:
 
 
 class Journal:
-    """Records of a job in a JSONL file that several processes may append to.
+    """Records of a job in a JSONL file that several processes may append to; failures in it do not count.
 
-    Records of failures that the file holds at first do not count, so that they are tried again. An item is
-    claimed by a lock on a byte of the file that its key names. The system drops these locks as soon as the
-    process closes the file anywhere: it stays open, and nothing else may open it during a run.
+    An item is claimed by a lock on a byte of the file that its key names. The system drops these locks as
+    soon as the process closes the file anywhere: it stays open, and nothing else may open it during a run.
     """
 
     def __init__(self, path: Path) -> None:
@@ -126,9 +114,7 @@ class Journal:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = open(path, "a+b", buffering=0)
         except OSError as error:
-            cure = "Name another, or free disk space and check its permissions."
-            got = f"{path.parent} ({error.strerror or error})"
-            bad_value("--out", "a folder that can be written to", got, cure)
+            unwritable(path.parent, error)
         self.close = weakref.finalize(self, self._file.close)
         self.refresh()
         self._records = {key: r for key, r in self._records.items() if r.get("status") != BROKEN}
@@ -154,7 +140,8 @@ class Journal:
 
     def put(self, item: Item, record: Record) -> None:
         """Append the record of an item, forced to the disk."""
-        record = {"key": item.key} | ({"inputs": item.inputs} if item.inputs else {}) | {**item.head} | record
+        named = {"key": item.key, "inputs": item.inputs} if item.inputs else {"key": item.key}
+        record = named | {**item.head} | record
         line = (json.dumps(record) + "\n").encode()
         self._lock(0, wait=True)
         try:
@@ -197,13 +184,9 @@ def _byte(item: Item) -> int:
 class Runner:
     """Takes the items of a job through stages, but for those that have a record.
 
-    Args:
-        items: no two of one key.
-        journal: of the records.
-        noun: what an item is, for the bar and messages.
-        survives: exceptions of a stage that fail its item only; every other one ends the run.
-        progress: show a bar with the time left, in the first process.
-        whole: whether what a record stands for is still there, such as files beside it; else it is made anew.
+    No two items have one key; ``noun`` is what an item is, for messages and the bar (``progress``), which the
+    first process shows. Exceptions of ``survives`` fail their item only, every other one ends the run. Where
+    ``whole`` says that what a record stands for is not there any more, it is made anew.
     """
 
     def __init__(
@@ -241,10 +224,7 @@ class Runner:
         The first stage takes an item, every other one what the stage before returned, and the last returns
         the body of the record. Several run side by side, a thread each, on ``most`` items at a time.
         ``release`` is called with every item that was begun, once it is through or has failed.
-
-        Raises:
-            ValueError: every item failed, all for one reason.
-            Exception: of a stage, unless it is one of ``survives``.
+        ``InputError``: all items failed for one reason.
         """
 
         def leave(item: Item) -> None:
@@ -348,10 +328,7 @@ class Runner:
 
 
 def _begin(item: Item, stages: Sequence[Stage], pools: Sequence[ThreadPoolExecutor]) -> Callable[[], Record]:
-    """Send an item through the stages, each in the thread of its pool; what is returned waits for the record.
-
-    Without pools there is one stage, which runs in the thread that waits.
-    """
+    """Send an item through the stages, each in its pool's thread, or the only one in that of who waits."""
     if not pools:
         return partial(stages[0], item)
     future = pools[0].submit(stages[0], item)

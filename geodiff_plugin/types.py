@@ -23,7 +23,7 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Rig:
-    """Calibration of a left and a right pinhole camera.
+    """Calibration of a left and a right pinhole camera; at 0.12 m to the right ``E[0, 3] == +0.12``.
 
     Attributes:
         K_left: ``(3, 3)`` float64, pixels of the left image.
@@ -37,9 +37,6 @@ class Rig:
         unit: ``"m"``, or ``None`` where the source does not say what its lengths are in.
         measured: whether the distance between the cameras is calibrated or measured, so that a refined pose
             keeps it; ``False`` for poses of a tracker, of SLAM or of structure from motion.
-
-    Convention:
-        A right camera 0.12 m to the right of the left one has ``E[0, 3] == +0.12``.
     """
 
     K_left: np.ndarray
@@ -66,8 +63,7 @@ class PoseReport:
     ``status`` is ``"given"`` (not checked, by configuration), ``"fits"``, ``"refined"``, ``"kept"`` (no
     better pose nearby), ``"mistaken"`` (a usual mistake explains the misfit; the pose is used as given) or
     ``"not checked"``. Residuals are in pixels of the right images, resized to the left image's pixels per
-    radian; the left image is at most 832 wide. ``scale_spread`` is ``None`` where the length of the baseline
-    is measured, and where the poses are used as given.
+    radian; the left image is at most 832 wide.
     """
 
     status: str
@@ -77,7 +73,7 @@ class PoseReport:
     residual_px: tuple[float, ...] = ()  # the same with the poses, and images, as used
     matches: tuple[float, ...] = ()  # their number, of each right view
     straightened_px: tuple[float, ...] = ()  # root mean square displacement of the right images; 0 for none
-    scale_spread: float | None = None  # relative standard deviation of the scale of refined poses
+    scale_spread: float | None = None  # relative, of the scale of refined poses; None for measured baselines
     warnings: tuple[str, ...] = ()  # sentences for the user
 
 
@@ -117,22 +113,19 @@ class MetricDepthOutput(BaseOutput):
     Attributes:
         prediction: metres; ``(N, H, W, 1)`` numpy or ``(N, 1, H, W)`` torch, as ``output_type`` says.
         uncertainty: metres, median absolute deviation of the ensemble members, each refined like
-            ``prediction``, from it; ``None`` without ``output_uncertainty=True``, or with fewer than two
-            members.
+            ``prediction``; ``None`` without ``output_uncertainty=True``, or with fewer than two members.
         latent: ``(N * E, 4, h, w)`` final latents, with ``output_latent=True``.
         relative: median unclipped relative depth, about [0, 1].
         space: what the prior's relative map is affine in, a key of ``SPACES``, as ``"depth"``.
         scale: ``(N, E)`` softplus of the learnt scale.
         shift: ``(N, E)`` softplus of the learnt shift.
         global_scale: ``(N, E)`` metres, the pre-selected g_s of Eq. 16.
-        own_scale: ``(N, E)`` median factor from a metric prior's metres to the result; ``None`` for a
-            relative one.
+        own_scale: ``(N, E)`` median factor from a metric prior's metres to the result, else ``None``.
         visible: boolean, in front of a right camera and inside its image; ``None`` without a right view.
-        photometric_error: [0, 1] mean absolute difference between the left image and the right view, warped,
+        photometric_error: [0, 1] mean absolute difference between the left image and the warped right view
             that matches the pixel best; 0 where not visible; ``None`` without a right view.
-        confidence: [0, 1] probability that the depth is within 10 % of the truth, from support, photometric
-            error, ``prior_error`` and, if there is an ensemble, uncertainty; ``None`` without ``crisp``, or
-            without matches and points.
+        confidence: [0, 1] probability that the depth is within 10 % of the truth; ``None`` without ``crisp``,
+            or without matches and points.
         support: [0, 1] how much matches and points, at the pixel or nearby on the same surface, determine the
             depth; ``None`` where ``confidence`` is.
         prior_error: ``(N,)`` error of the prior alone, standard deviation in log depth, estimated from
@@ -142,8 +135,8 @@ class MetricDepthOutput(BaseOutput):
         poses: one ``PoseReport`` per image with right views.
         extras: further maps of the prior by name (GeoWizard's ``"normals"``), but for their channels.
         verdicts: one ``runtime.verdict.Verdict`` per image: whether the depth can be trusted, and why not.
-        unit: ``"m"``, or ``None`` if no length is known; lengths are then in the unit of the given poses, or
-            in units of the first baseline where poses were estimated.
+        unit: ``"m"``, or ``None`` if no length is known: lengths are then in the unit of the given poses, or
+            of the first estimated baseline.
         scale_from: source of the scale of estimated poses: ``"baseline"``, ``"known length"``, ``"points"``,
             ``"prior"`` or ``"none"``; ``None`` for given poses, but ``"prior"`` where they had no unit.
         scale_spread: relative spread of that scale over matches or the prior's map; ``None`` if unknown.

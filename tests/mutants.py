@@ -274,8 +274,8 @@ MUTANTS = [
         ),
     ),
     *of(
-        "formats/lenses.py",
-        ("(per_unit_y or per_unit_x)", "per_unit_x"),
+        "formats/images.py",
+        ("(number(Base.FocalPlaneYResolution) or per_unit_x)", "per_unit_x"),
         ("{2: 25.4, 3: 10.0,", "{2: 25.4, 3: 25.4,"),
         ("math.hypot(36.0, 24.0)", "36.0"),
         ("max(width, height) / max(taken)", "1.0"),

@@ -22,7 +22,7 @@ from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
 from geodiff_plugin.formats.depth import depth_of_disparity, read_confidence, read_map
-from geodiff_plugin.formats.lenses import (
+from geodiff_plugin.formats.images import (
     distortion_from_text,
     intrinsics_from_exif,
     intrinsics_from_fov,

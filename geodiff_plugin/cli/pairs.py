@@ -16,7 +16,7 @@ from geodiff_plugin.cli.options import DepthOptions, check_files, told_apart
 from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.formats.files import MAP_SUFFIXES, check_file, find_map
 from geodiff_plugin.formats.out import check_out
-from geodiff_plugin.formats.recordings import VIDEOS, count_frames, is_bag, is_video, list_pairs
+from geodiff_plugin.formats.recordings import VIDEOS, is_bag, is_video, list_pairs, video_facts
 
 #: The table of a run, and its columns.
 SUMMARY = "pairs.csv"
@@ -136,12 +136,12 @@ def _of_folders(left: Path, right: Path | None) -> tuple[list[PairRef], str]:
 
 
 def _of_videos(left: Path, right: Path | None) -> tuple[list[PairRef], str]:
-    frames = count_frames(left, "LEFT")
+    frames = video_facts(left, "LEFT")[0]
     if right is None:
         return _frames(frames, left, None), f"{left} holds both views side by side; else name both videos."
     if not is_video(right):
         bad_value("RIGHT", f"a video too ({', '.join(VIDEOS)}), or left out", right)
-    if (others := count_frames(right, "RIGHT")) != frames:
+    if (others := video_facts(right, "RIGHT")[0]) != frames:
         cure = "Cut them to the same moments first."
         bad_value("RIGHT", f"a video of {frames} frames, as the left one", f"{others} frames", cure)
     return _frames(frames, left, right), ""

@@ -5,40 +5,23 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-#: Name -> module, imported on first use: some of them need torch, and a file can be looked at without.
-_MODULE_OF = {
-    "CALIBRATION_FORMATS": "reading",
-    "Cloud": "clouds",
-    "MIN_SIDE": "images",
-    "as_image_01": "images",
-    "atomic_path": "out",
-    "check_file": "files",
-    "depth_mm": "depth",
-    "flying_points": "clouds",
-    "make_cloud": "clouds",
-    "picture_size": "images",
-    "read_calibration": "reading",
-    "read_depth_png": "depth",
-    "read_image": "images",
-    "read_matrix": "files",
-    "read_pfm": "depth",
-    "read_points": "depth",
-    "read_text": "files",
-    "rig_from_parameters": "rigs",
-    "write_colmap": "sfm",
-    "write_depth_mm": "depth",
-    "write_depth_npy": "depth",
-    "write_glb": "clouds",
-    "write_pfm": "depth",
-    "write_ply": "clouds",
+#: What other programs use, by module; imported on first use, since some of them need torch.
+_NAMES = {
+    "clouds": ("Cloud", "flying_points", "make_cloud", "write_glb", "write_ply"),
+    "depth": ("read_depth_png", "read_pfm", "read_points", "write_depth_mm", "write_depth_npy", "write_pfm"),
+    "files": ("check_file", "read_matrix", "read_text"),
+    "images": ("as_image_01", "picture_size", "read_image"),
+    "out": ("atomic_path",),
+    "reading": ("CALIBRATION_FORMATS", "read_calibration"),
+    "rigs": ("rig_from_parameters",),
+    "sfm": ("write_colmap",),
 }
 
-__all__ = sorted(_MODULE_OF)  # noqa: PLE0605
+__all__ = sorted(name for names in _NAMES.values() for name in names)  # noqa: PLE0605
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULE_OF:
+    module = next((module for module, names in _NAMES.items() if name in names), None)
+    if module is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
-    globals()[name] = value
-    return value
+    return getattr(importlib.import_module(f"{__name__}.{module}"), name)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from geodiff_plugin._checks import InputError, MissingFileError, bad_value
 from geodiff_plugin.formats.files import read_matrix, read_rows, read_text, upright_size
-from geodiff_plugin.formats.lenses import intrinsics_from_exif, intrinsics_from_fov
+from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.formats.recordings import is_video, video_facts
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, lens_of, reading_whole, resized, rigid
 from geodiff_plugin.formats.sfm import (

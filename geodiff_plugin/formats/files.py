@@ -14,7 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from geodiff_plugin._checks import InputError, InputFileError, MissingFileError, bad_type, bad_value, quoted
+from geodiff_plugin._checks import InputError, InputFileError, MissingFileError, bad_type, bad_value
 
 if TYPE_CHECKING:  # what is wrong with a file is said before numpy is imported
     import numpy as np
@@ -35,19 +35,17 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
     """The path of an existing, readable, non-empty file; messages name the argument and what it is."""
     if not isinstance(path, (str, os.PathLike)):
         bad_type(name, f"the path of {what}", path)
-    file, shown = Path(path), quoted(path)
+    file = Path(path)
     if os.path.isdir(file):
-        raise InputFileError(f"{name} must be {what}; got the folder {shown}. Name the file inside it.")
+        bad_value(name, what, f"the folder {path}", "Name the file inside it.", InputFileError)
     if not os.path.exists(file):  # Path.exists() raises on a name that is too long
-        raise MissingFileError(
-            f"{name} must be {what}; got {shown}, which does not exist. Check the spelling."
-        )
+        bad_value(name, what, f"{path}, which does not exist", "Check the spelling.", MissingFileError)
     if not file.is_file():
-        bad_value(name, what, f"{shown}, which is a pipe or a device", "Save what it gives as a file first.")
+        bad_value(name, what, f"{path}, which is a pipe or a device", "Save what it gives as a file first.")
     if not os.access(file, os.R_OK):
-        raise InputFileError(f"{name} must be {what} that you may read; got {shown}. Check its permissions.")
+        bad_value(name, what, f"{path}, which you may not read", "Check its permissions.", InputFileError)
     if file.stat().st_size == 0:
-        bad_value(name, what, f"{shown}, which is empty", "Was its download or copy cut off? Fetch it again.")
+        bad_value(name, what, f"{path}, which is empty", "Was its download or copy cut off? Fetch it again.")
     return file
 
 
@@ -109,12 +107,9 @@ def read_text(path: str | os.PathLike[str], name: str, what: str = "a text file"
     raw = file.read_bytes()
     wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # as Windows' shell and Notepad write
     text = raw.decode("utf-16" if wide else "utf-8-sig", errors="replace")
-    if "\0" in text:
-        bad_value(name, what, f"{file}, which holds binary data", cure)
-    text = text.replace("\r\n", "\n").replace("\r", "\n")
-    if not text.strip():
-        bad_value(name, what, f"{file}, which holds only blanks", "Fetch it again.")
-    return text
+    if "\0" in text or not text.strip():
+        bad_value(name, what, f"{file}, which holds {'binary data' if text.strip() else 'only blanks'}", cure)
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def read_rows(path: str | os.PathLike[str], name: str, what: str) -> list[list[str]]:
@@ -150,15 +145,15 @@ def read_npy(path: Path, name: str, expected: str) -> np.ndarray:
     """The array of real numbers of an existing file, in the file's own type; nothing is unpickled."""
     import numpy as np
 
+    cure = "Save one array with numpy.save."
     try:
         value = np.load(path, allow_pickle=False)
     except Exception as error:  # a damaged head is parsed as Python, which may fail in any way
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         if "pickle" in reason:  # numpy's own words tell how to run what is in there
             reason = "pickled objects, which are never loaded"
-        bad_value(name, expected, f"{path}, which numpy cannot load ({reason})", "Save it with numpy.save.")
+        bad_value(name, expected, f"{path}, which numpy cannot load ({reason})", cure)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
-        cure = "Save one array with numpy.save."
         bad_value(name, expected, f"{path} without an array of real numbers", cure)
     return value
 
@@ -171,12 +166,11 @@ def read_matrix(path: str | os.PathLike[str], name: str = "matrix") -> np.ndarra
     if file.suffix.lower() == ".npy":
         matrix = read_npy(file, name, MATRIX).astype(np.float64)
     else:
-        rows = [  # without the brackets of Python and JSON
-            [number for word in row if (number := word.strip("[]()"))]
-            for row in read_rows(file, name, MATRIX)
-        ]
+        rows = [
+            " ".join(row).strip("[]() ") for row in read_rows(file, name, MATRIX)
+        ]  # as Python and JSON too
         try:
-            matrix = np.array(rows, dtype=np.float64)
+            matrix = np.array([re.split(r"[\[\]() ]+", row) for row in rows if row], dtype=np.float64)
         except ValueError:
             cure = "Is it cut off? A calibration file with words goes to --calib."
             bad_value(name, MATRIX, f"{path} with words in it, or rows of several lengths", cure)

@@ -1,28 +1,44 @@
-"""Images from files and from memory as floats in [0, 1] (S3.3, the two views)."""
+"""Images from files and memory as floats in [0, 1] (S3.3, the two views); their EXIF data; their lenses."""
 
 from __future__ import annotations
 
+import math
 import os
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from PIL import Image, ImageOps
+from PIL.ExifTags import IFD, Base
 
-from geodiff_plugin._checks import bad_type, bad_value, warn
+from geodiff_plugin._checks import InputError, bad_type, bad_value, check_number, warn
 from geodiff_plugin.formats.files import ORIENTATION, open_image
+from geodiff_plugin.formats.rigs import COEFFICIENT_COUNTS, intrinsics
+from geodiff_plugin.types import Distortion
 
 #: Fewer pixels a side hold no matches; also the VAE's smallest sensible latent.
 MIN_SIDE = 32
 #: Resampling may overshoot [0, 1] by a little; more than this is another range.
 OVERSHOOT = 1e-3
-#: Values of the EXIF orientation of an image that is to be turned or mirrored.
+#: EXIF's orientations of an image that is to be turned or mirrored.
 TURNS = range(2, 9)
 #: 16-bit values that all lie below this are those of a camera of 10 or 12 bits, as they come.
 DARK_16_BITS = 8192
 CHANNELS = (1, 3, 4)
 #: Formats that hold several frames or pages of one kind; others hold previews.
 SEVERAL = ("GIF", "PNG", "TIFF", "WEBP")
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+#: Diagonal of a 35 mm frame, which equivalent focal lengths are compared by.
+_DIAGONAL_35_MM = math.hypot(36.0, 24.0)
+#: A focal length further off its EXIF than this factor is of an image of another size: EXIF is known to a few
+#: per cent, and rectification or a lens that was straightened changes it by less.
+_OTHER_LENS = 1.4
+#: Sides may be rounded by this share before an image counts as cropped.
+_SAME_SHAPE = 0.01
+CURES = "Give K (--fx --fy --cx --cy or --K), a field of view (--fov), or photographs with their EXIF."
+#: When OpenCV's search for a ray ends, and how near to its pixel a ray that was found comes back.
+UNTIL, TOLERANCE_PX = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-9), 0.01
 
 
 def _check_sides(width: int, height: int, name: str) -> None:
@@ -52,16 +68,14 @@ def _file_notes(image: Image.Image, name: str) -> list[str]:
         notes.append(f"{name} holds {frames} frames or pages; only the first is taken.")
     # Pillow loads the upper 8 bits of these, and tells only before.
     if any(";16" in str(tile[3]) for tile in getattr(image, "tile", ())) and not image.mode.startswith("I"):
-        most = 257 * int(np.asarray(image.convert("RGB")).max())
-        notes += [_dark_note(most, name)] if most < DARK_16_BITS else []
+        notes += _dark_notes(257 * int(np.asarray(image.convert("RGB")).max()), name)
     return notes
 
 
-def _dark_note(most: int, name: str) -> str:
-    return (
-        f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535. "
-        "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
-    )
+def _dark_notes(most: int, name: str) -> list[str]:
+    said = f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535."
+    cure = "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
+    return [f"{said} {cure}"] if most < DARK_16_BITS else []
 
 
 def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
@@ -70,8 +84,7 @@ def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
     if value.shape[-1] == 4:
         value, notes = value[..., :3], [f"{name} has an alpha channel; it is dropped."]
     if value.dtype in (np.uint8, np.uint16):
-        if value.dtype == np.uint16 and value.max() < DARK_16_BITS:
-            notes.append(_dark_note(int(value.max()), name))
+        notes += _dark_notes(int(value.max()), name) if value.dtype == np.uint16 else []
         value = value.astype(np.float32) / np.iinfo(value.dtype).max
     elif value.dtype.kind == "f":
         if not np.isfinite(value).all():
@@ -96,18 +109,18 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
         OSError, ValueError: no readable file; not an image, cut off, or a side under 32 pixels.
     """
     with open_image(path, name) as image:
-        said = _file_notes(image, name)
+        notes = _file_notes(image, name)
         image.seek(0)
         image.load()
         is_turned = image.getexif().get(ORIENTATION) in TURNS
         upright = ImageOps.exif_transpose(image)
-    image_01, notes = _to_01(_array_of(upright, name), name)
-    notes = said + notes
+    image_01, more = _to_01(_array_of(upright, name), name)
+    notes += more
     if is_turned:
-        notes.append(
-            f"{name} was turned or mirrored to {upright.width}x{upright.height}, as its EXIF orientation "
-            "says; K must belong to the turned image."
+        said = (
+            f"{name} was turned or mirrored to {upright.width}x{upright.height}, as its EXIF orientation says"
         )
+        notes.append(f"{said}; K must belong to the turned image.")
     return image_01, notes
 
 
@@ -154,16 +167,134 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
         ValueError: wrong rank or channels, NaN or infinity, floats outside [0, 1], a side under 32 pixels.
     """
     if isinstance(value, Image.Image):
-        said = _file_notes(value, name)
-        hwc, notes = _to_01(_array_of(value, name), name)
-        notes = said + notes
+        notes = _file_notes(value, name)
+        hwc, more = _to_01(_array_of(value, name), name)
         if value.getexif().get(ORIENTATION) in TURNS:
-            notes.append(
-                f"{name} carries an EXIF orientation that is not applied; "
-                "turn it with PIL.ImageOps.exif_transpose and give the K of the turned image."
-            )
+            cure = "turn it with PIL.ImageOps.exif_transpose and give the K of the turned image."
+            more.append(f"{name} carries an EXIF orientation that is not applied; {cure}")
     else:
-        hwc, notes = _to_01(_hwc(value, name), name)
-    for note in notes:
+        notes, (hwc, more) = [], _to_01(_hwc(value, name), name)
+    for note in notes + more:
         warn(note, stacklevel=3)
     return torch.from_numpy(np.ascontiguousarray(hwc.transpose(2, 0, 1)))
+
+
+def intrinsics_from_fov(fov_deg: float, size: tuple[int, int]) -> np.ndarray:
+    """K of a camera with square pixels and its principal point in the middle; ``fov_deg`` is horizontal."""
+    check_number(fov_deg, "fov", 1.0, 170.0)
+    focal = size[0] / 2 / math.tan(math.radians(fov_deg) / 2)
+    return intrinsics(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
+
+
+def intrinsics_from_exif(
+    source: str | os.PathLike[str] | Image.Image, name: str
+) -> tuple[np.ndarray, list[str]]:
+    """K of a photograph, to a few per cent, and sentences about what was assumed.
+
+    Of a file for its upright pixels, of an image in memory for its pixels as they lie; refused without a
+    focal length, or where the image was cropped since.
+    """
+    if not isinstance(source, Image.Image):
+        with open_image(source, name) as image:
+            K, notes = intrinsics_from_exif(image, name)
+            turned = image.getexif().get(ORIENTATION, 1) >= 5
+        return intrinsics(K[1, 1], K[0, 0], K[1, 2], K[0, 2]) if turned else K, notes
+    entries = source.getexif().get_ifd(IFD.Exif)
+
+    def number(tag: Base) -> float:
+        try:
+            value = float(entries.get(tag) or 0.0)
+        except (TypeError, ValueError, ZeroDivisionError):
+            return 0.0
+        return value if math.isfinite(value) and value > 0 else 0.0
+
+    width, height = source.size
+    taken = number(Base.ExifImageWidth), number(Base.ExifImageHeight)
+    if all(taken):
+        shapes = [(taken[0] / taken[1]) / shape for shape in (width / height, height / width)]
+        if min(max(ratio, 1 / ratio) for ratio in shapes) > 1 + _SAME_SHAPE:
+            got = f"one of {taken[0]:.0f}x{taken[1]:.0f}: it was cropped since it was taken"
+            cure = f"Give the image as it was taken. {CURES}"
+            bad_value(f"EXIF of {name}", f"of an image of {width}x{height}", got, cure)
+    focal_35, focal_mm = number(Base.FocalLengthIn35mmFilm), number(Base.FocalLength)
+    per_unit_x, zoom = number(Base.FocalPlaneXResolution), number(Base.DigitalZoomRatio)
+    if focal_35:
+        fx = fy = focal_35 * math.hypot(width, height) / _DIAGONAL_35_MM
+        notes = [f"K of {name}: {focal_35:g} mm in 35 mm equivalent by its EXIF, {fx:.0f} px."]
+    elif focal_mm and per_unit_x and taken[0]:
+        mm = _MM_PER_UNIT.get(int(number(Base.FocalPlaneResolutionUnit) or 2), 25.4)
+        fx = focal_mm * per_unit_x / mm * (max(width, height) / max(taken)) * max(zoom, 1.0)
+        fy = fx * (number(Base.FocalPlaneYResolution) or per_unit_x) / per_unit_x
+        notes = [f"K of {name}: {focal_mm:g} mm on its sensor by its EXIF, {fx:.0f} px."]
+    else:
+        bad_value(f"K of {name}", "known", "no focal length in its EXIF", CURES)
+    if zoom > 1.01:
+        notes.append(f"{name} was zoomed digitally by {zoom:g}; some cameras do not count that in.")
+    return intrinsics(fx, fy, (width - 1) / 2, (height - 1) / 2), notes
+
+
+def warn_of_other_lens(source: str | os.PathLike[str] | Image.Image, K: np.ndarray, name: str) -> None:
+    """Warn of a focal length that contradicts the EXIF data of an uncropped image."""
+    try:
+        theirs, notes = intrinsics_from_exif(source, name)
+    except InputError:
+        return
+    factor = K[0, 0] / theirs[0, 0]
+    if len(notes) == 1 and max(factor, 1 / factor) >= _OTHER_LENS:
+        said = f"{factor:.2f} times the {theirs[0, 0]:.0f} px of its EXIF: is K for an image of another size?"
+        cure = "If it is, all metres are off by that factor."
+        warn(f"K has a focal length of {K[0, 0]:.0f} px for {name}, {said} {cure}", stacklevel=3)
+
+
+def distortion_from_text(text: str, name: str = "--distortion") -> Distortion:
+    """Coefficients as they are typed: ``k1,k2,p1,p2[,k3...]``, or ``fisheye:k1,k2,k3,k4``."""
+    model, colon, numbers = text.rpartition(":")
+    model = model if colon else "opencv"
+    try:
+        coefficients = np.array(numbers.split(","), dtype=np.float64)
+    except ValueError:
+        coefficients = np.zeros(0)
+    if len(coefficients) not in COEFFICIENT_COUNTS.get(model, ()) or not np.isfinite(coefficients).all():
+        cure = "The order is OpenCV's: k1,k2,p1,p2,k3."
+        bad_value(name, "k1,k2,p1,p2[,k3[,...]] or fisheye:k1,k2,k3,k4", repr(text), cure)
+    return Distortion(model, coefficients)
+
+
+def undistorted(image_01: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
+    """The image ``(H, W, 3)`` in [0, 1] of a pinhole camera with the same K and size; black without a ray."""
+    coefficients, K = np.asarray(distortion.coefficients, np.float64), np.asarray(K, np.float64)
+    if distortion.model == "fisheye":
+        straight = cv2.fisheye.undistortImage(image_01, K, coefficients, Knew=K)
+    else:
+        straight = cv2.undistort(image_01, K, coefficients)
+    return straight.clip(0.0, 1.0).astype(np.float32)
+
+
+def undistorted_pixels(pixels: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
+    """Where pixels ``(N, 2)`` of the image as taken lie in that of ``undistorted``, with the same K.
+
+    Float64, x and y, also outside of the image; NaN where the model sends no ray to a pixel.
+    """
+    taken, K = np.asarray(pixels, np.float64).reshape(-1, 1, 2), np.asarray(K, np.float64)
+    if not len(taken):
+        return taken[:, 0]
+    coefficients, still = np.asarray(distortion.coefficients, np.float64), np.zeros(3)
+    if distortion.model == "fisheye":
+        straight = cv2.fisheye.undistortPoints(taken, K, coefficients, R=np.eye(3), P=K, criteria=UNTIL)
+        rays = cv2.convertPointsToHomogeneous(straight) @ np.linalg.inv(K).T
+        back = cv2.fisheye.distortPoints(rays[..., :2], K, coefficients)
+    else:
+        straight = cv2.undistortImagePoints(taken, K, coefficients, None, UNTIL)
+        rays = cv2.convertPointsToHomogeneous(straight) @ np.linalg.inv(K).T
+        back = cv2.projectPoints(rays, still, still, K, coefficients)[0]
+    found = np.abs(back - taken).max(axis=2) < TOLERANCE_PX
+    return np.where(found, straight[:, 0], np.nan)
+
+
+def undistorted_points(depth_m: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
+    """Known depths ``(H, W)`` metres of an image as taken as points ``(N, 3)`` of the camera, unmixed."""
+    rows, columns = np.nonzero(np.isfinite(depth_m) & (depth_m > 0))
+    straight = undistorted_pixels(np.stack([columns, rows], axis=1), K, distortion)
+    rays = np.concatenate([straight, np.ones((len(straight), 1))], axis=1) @ np.linalg.inv(K).T
+    points = rays * depth_m[rows, columns, None]
+    return points[np.isfinite(points).all(axis=1)].astype(np.float32)

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import NoReturn, Self, TypeVar
 
 from geodiff_plugin._checks import InputFileError, MissingFileError, bad_value
 
@@ -25,7 +25,7 @@ except ImportError:  # Windows: two runs with one folder are not detected
 PARTIAL, LOCK, FILES = ".geodiff-partial", "lock", "files"
 #: Lists what a run wrote, and is written last.
 REPORT = "report.json"
-#: A disk with less room takes no result, however small its picture.
+#: A disk with less room takes no result.
 LEAST_FREE_BYTES = 8 << 20
 
 Result = TypeVar("Result")
@@ -36,11 +36,10 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary path beside ``path``, renamed to it when the block ends well, else removed."""
     target = Path(path)
     if os.path.isdir(target):
-        raise InputFileError(f"The output must be a file; got the folder {target}. Name a file inside of it.")
+        bad_value("The output", "a file", f"the folder {target}", "Name a file inside of it.", InputFileError)
     if not os.path.isdir(target.parent):
-        raise MissingFileError(
-            f"The output must be in an existing folder; got {target}. Make the folder {target.parent} first."
-        )
+        cure = f"Make the folder {target.parent} first."
+        bad_value("The output", "in an existing folder", target, cure, MissingFileError)
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
     try:
         yield temporary
@@ -62,6 +61,12 @@ def reason_of(error: OSError) -> str:
     return error.strerror or str(error)
 
 
+def unwritable(path: Path, error: OSError) -> NoReturn:
+    """Refuse an output folder that takes no file."""
+    cure = "Name another with --out, or free disk space and check its permissions."
+    bad_value("--out", "a folder that can be written to", f"{path} ({reason_of(error)})", cure)
+
+
 def _beside(target: Path) -> Path:
     return target.parent / f".{target.name}{PARTIAL}"
 
@@ -78,7 +83,7 @@ def check_out(path: Path) -> Path:
         with suppress(FileNotFoundError):
             os.stat(_beside(target))  # the longest name that will be needed
     except OSError as error:
-        bad_value("--out", "a folder that can be made", f"{path} ({reason_of(error)})", "Name another.")
+        unwritable(path, error)
     if target.exists() and not target.is_dir():
         bad_value("--out", "a folder", f"the file {path}", "Name a folder.")
     return target
@@ -91,11 +96,12 @@ def _holds_files(target: Path) -> bool:
 
 def free_folder(default: Path) -> Path:
     """A folder for a run that named none: ``default``, or ``default-2`` and so on where that is taken."""
-    for number in itertools.count(1):
-        path = default if number == 1 else default.with_name(f"{default.name}-{number}")
+    path = default
+    for number in itertools.count(2):
         taken = os.path.lexists(path) and (not path.is_dir() or _holds_files(path))
         if not taken and not _held(_hidden(path)):
             break
+        path = default.with_name(f"{default.name}-{number}")
     return path
 
 
@@ -130,8 +136,8 @@ def _files_of_report(folder: Path) -> set[str]:
 class OutFolder:
     """A folder that this process alone writes to, from before the work until the result is in it.
 
-    Whatever speaks against it is said on entry. None of ``inputs``, which the run reads, may lie in it. With
-    ``overwrite`` it may hold files: an earlier run's, by its report, go; all others stay.
+    Whatever speaks against it is said on entry, also that it holds one of ``inputs``. With ``overwrite`` it
+    may hold files: an earlier run's, by its report, go; all others stay.
     """
 
     def __init__(self, path: Path, *, inputs: Collection[Path] = (), overwrite: bool = False) -> None:
@@ -152,9 +158,7 @@ class OutFolder:
             try:
                 self._begin(stack)
             except OSError as error:
-                cure = "Name another with --out, or free disk space and check its permissions."
-                got = f"{self.path} ({reason_of(error)})"
-                bad_value("--out", "a folder that can be written to", got, cure)
+                unwritable(self.path, error)
             self._stack = stack.pop_all()
         return self
 
@@ -176,14 +180,10 @@ class OutFolder:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         if (staging / FILES).exists():  # we have the lock, so whoever made them is gone
             shutil.rmtree(staging / FILES)
-            line = f"geodiff: removed what a run that was killed had left in {staging}"
-            print(line, file=sys.stderr, flush=True)
+            print(f"geodiff: removed what a killed run had left in {staging}", file=sys.stderr, flush=True)
 
     def write(self, fill: Callable[[Path], Result]) -> Result:
-        """Let ``fill`` write into an empty folder, whose files are then moved; returns what ``fill`` does.
-
-        A new folder appears by one rename. In one that exists each file is replaced, the report last.
-        """
+        """Let ``fill`` write into an empty folder, whose files are then moved; returns what ``fill`` does."""
         files = self._staging / FILES
         try:
             files.mkdir()
@@ -199,6 +199,7 @@ class OutFolder:
         return result
 
     def _move(self, files: Path) -> None:
+        """Let a new folder appear by one rename; in one that exists replace each file, the report last."""
         if not self._target.is_dir():
             os.rename(files, self._target)
             return

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin._checks import bad_type, bad_value, check_number, warn
-from geodiff_plugin.formats import robots, sfm, stereo
+from geodiff_plugin.formats import sfm, stereo
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
 from geodiff_plugin.types import Rig
 
@@ -30,7 +30,7 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         "K.txt of FoundationStereo (9 numbers, baseline)", r"\A(?i:[-+.\de\s,]|nan|inf)+\Z",
         stereo.read_foundation_stereo),
     "booster": CalibrationFormat(
-        "Booster xml (proj_matL)", r"<opencv_st[\s\S]*proj_matL", robots.read_booster),
+        "Booster xml (proj_matL)", r"<opencv_st[\s\S]*proj_matL", stereo.read_booster),
     "mvsnet": CalibrationFormat(
         "pair of MVSNet cam.txt (extrinsic)", r"^\s*extrinsic\s*$", stereo.read_mvsnet, (2,)),
     "zed": CalibrationFormat(
@@ -44,18 +44,18 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         "transforms.json of nerfstudio or instant-ngp (frames, transform_matrix)",
         _JSON + r'(?=[\s\S]*"frames")(?=[\s\S]*"transform_matrix")', sfm.read_nerf, by_image=True),
     "kalibr": CalibrationFormat(
-        "Kalibr camchain.yaml (cam0)", r"^cam\d+:\s*(?:#.*)?$", robots.read_kalibr, uses_cameras=True),
-    "euroc": CalibrationFormat("pair of EuRoC sensor.yaml (T_BS)", r"^T_BS\s*:", robots.read_euroc, (2,)),
+        "Kalibr camchain.yaml (cam0)", r"^cam\d+:\s*(?:#.*)?$", stereo.read_kalibr, uses_cameras=True),
+    "euroc": CalibrationFormat("pair of EuRoC sensor.yaml (T_BS)", r"^T_BS\s*:", stereo.read_euroc, (2,)),
     # Older settings describe the rectification too, and OpenCV's reader has these names.
     "orb_slam": CalibrationFormat(
         "ORB-SLAM's stereo settings (Camera1.fx, Camera.bf)",
-        r"\A(?![\s\S]*^LEFT\.P[ \t]*:)[\s\S]*^(?:Camera1?\.fx|Camera\.bf)[ \t]*:", robots.read_orb_slam),
+        r"\A(?![\s\S]*^LEFT\.P[ \t]*:)[\s\S]*^(?:Camera1?\.fx|Camera\.bf)[ \t]*:", stereo.read_orb_slam),
     "opencv": CalibrationFormat(
         "OpenCV YAML, XML or JSON (P1, P2, or M1, M2, R, T)",
-        r'!!opencv-matrix|<opencv_storage|"opencv-matrix"', robots.read_opencv, (1, 2)),
+        r'!!opencv-matrix|<opencv_storage|"opencv-matrix"', stereo.read_opencv, (1, 2)),
     "ros": CalibrationFormat(
         "pair of ROS camera_info (projection_matrix)",
-        r"^(projection_matrix|distortion_model|rectification_matrix)\s*:", robots.read_ros, (2,)),
+        r"^(projection_matrix|distortion_model|rectification_matrix)\s*:", stereo.read_ros, (2,)),
     "stereodemo": CalibrationFormat(
         "stereodemo JSON (fx)", _JSON + r'(?=[\s\S]*"fx")', stereo.read_stereodemo),
     "colmap": CalibrationFormat(
@@ -70,8 +70,6 @@ def _texts(path: PathLike | Sequence[PathLike]) -> dict[Path, str]:
     paths = (path,) if isinstance(path, (str, os.PathLike)) else path
     if not isinstance(paths, (tuple, list)) or not all(isinstance(p, (str, os.PathLike)) for p in paths):
         bad_type("calibration", "a path, or a pair of paths (left, right)", path)
-    if len(paths) not in (1, 2):
-        bad_value("calibration", "one file, or a pair (left, right)", f"{len(paths)} files")
     if len(paths) == 1 and os.path.isdir(paths[0]):
         paths = sfm.model_files(Path(paths[0])) or paths
     return {Path(file): sfm.calibration_text(file) for file in paths}
@@ -79,21 +77,20 @@ def _texts(path: PathLike | Sequence[PathLike]) -> dict[Path, str]:
 
 def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
     """The format that all files have, as many as it needs."""
-    names = []
+    names = set()
     for path, text in texts.items():
-        fits = (name for name, each in CALIBRATION_FORMATS.items() if re.search(each.mark, text, re.M))
-        name = next(fits, None)
-        if name is None:
+        fits = [name for name, each in CALIBRATION_FORMATS.items() if re.search(each.mark, text, re.M)]
+        if not fits:
             formats = "; ".join(entry.summary for entry in CALIBRATION_FORMATS.values())
             cure = "Is this the right file? Otherwise give fx, fy, cx, cy and baseline, or K and E."
             bad_value("calibration", f"in a known format ({formats})", f"{path}, which is none of them", cure)
-        names.append(name)
-    if len(set(names)) > 1:
-        bad_value("calibration", "two files of one format", " and ".join(names))
-    entry = CALIBRATION_FORMATS[names[0]]
+        names.add(fits[0])
+    if len(names) != 1:
+        bad_value("calibration", "files of one format", " and ".join(sorted(names)) or "none")
+    entry = CALIBRATION_FORMATS[names.pop()]
     if len(texts) not in entry.file_counts:
         count, cure = "one file", "It describes both cameras; give it once."
-        if len(texts) == 1:
+        if len(texts) < min(entry.file_counts):
             count, cure = "two files", "Give --calib twice, for the left and the right view."
         bad_value("calibration", f"{count} ({entry.summary})", " and ".join(map(str, texts)), cure)
     return entry
@@ -104,11 +101,8 @@ def _in_metres(rig: Rig, baseline_m: float | None, by_image: bool) -> Rig:
     if baseline_m is None:
         if not by_image:
             return rig
-        warn(
-            f"{rig.source} has no unit: depth comes out in the model's own. Give the measured "
-            "distance of the two cameras as baseline_m (--baseline) to get metres.",
-            stacklevel=3,
-        )
+        cure = "Give the measured distance of the two cameras as baseline_m (--baseline) to get metres."
+        warn(f"{rig.source} has no unit: depth comes out in the model's own. {cure}", stacklevel=3)
         return replace(rig, unit=None, measured=False)
     check_number(baseline_m, "baseline_m", float(np.finfo(np.float64).tiny), 1e9)
     length = float(np.linalg.norm(rig.E[:3, 3]))
@@ -144,16 +138,12 @@ def read_calibration(
         distorted: whether the caller takes lens distortion out of the images (``Rig.distortion``).
 
     Returns:
-        The rig: K in pixels of the images that the file is for, E in metres.
+        The rig: K in pixels of the images that the file is for, E in metres: a right camera 0.12 m to the
+        right of the left one has ``E[0, 3] == +0.12``.
 
     Raises:
-        OSError: no readable file (FileNotFoundError: none at all).
-        TypeError: not a path or a pair of paths.
-        ValueError: empty, unknown format, cut off, lens distortion unless ``distorted``, cameras that are not
-            there.
-
-    Convention:
-        A right camera 0.12 m to the right of the left one has ``E[0, 3] == +0.12``.
+        OSError, TypeError: no readable file (FileNotFoundError: none at all); no path.
+        ValueError: unknown format, cut off, cameras that are not there, lens distortion unless ``distorted``.
     """
     texts = _texts(path)
     entry, source = _format_of(texts), " and ".join(map(str, texts))
@@ -165,9 +155,9 @@ def read_calibration(
     for side, lens in zip(("left", "right"), rig.distortion, strict=True):
         if lens is not None and not distorted:
             cure = (
-                "Undistort or rectify both images first and give the calibration of the result (P1, P2), "
-                "or use geodiff depth, which undistorts them."
+                "Undistort or rectify both images first and give the calibration of the result (P1, P2), or "
             )
+            cure += "use geodiff depth, which undistorts them."
             got = f"{lens.model} {np.array2string(lens.coefficients, precision=4, separator=', ')}"
             name = f"Lens distortion of the {side} camera in {source}"
             bad_value(name, "zero (images of a pinhole camera)", got, cure)

@@ -16,14 +16,13 @@ import cv2
 import numpy as np
 import yaml
 
-from geodiff_plugin._checks import InputFileError, bad_value, refuse
+from geodiff_plugin._checks import InputError, InputFileError, bad_value, refuse
 from geodiff_plugin.formats.depth import depth_mm
 from geodiff_plugin.formats.files import check_file
 
 #: Suffixes of videos, and of bags that can be written: one MCAP file of ROS 2, or a bag of ROS 1.
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 BAG_SUFFIXES = (".mcap", ".bag")
-FRAME_SIZE = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
 #: Encoding of a raw image -> type of its numbers, channels, and what makes RGB of it. OpenCV names Bayer
 #: patterns by the second row, ROS by the first.
 ENCODINGS: dict[str, tuple[str, int, int | None]] = {
@@ -47,26 +46,21 @@ def is_video(path: Path) -> bool:
 def _open_video(path: Path, name: str) -> cv2.VideoCapture:
     capture = cv2.VideoCapture(str(check_file(path, name, "a video file")))
     if not capture.isOpened():
-        cure = "Convert it, or extract its frames into a folder."
-        bad_value(name, "a video that OpenCV reads", path, cure)
+        bad_value(name, "a video that OpenCV reads", path, "Convert it, or extract its frames into a folder.")
     return capture
 
 
 def video_facts(path: Path, name: str = "video") -> tuple[int, float, tuple[int, int]]:
-    """How many frames a video has, by going through it, its frames a second, and ``(width, height)``."""
+    """Number of frames, by going through them: heads are not reliable; frames a second, (width, height)."""
     capture, count = _open_video(path, name), 0
     while capture.grab():
         count += 1
-    fps, *size = (capture.get(fact) for fact in (cv2.CAP_PROP_FPS, *FRAME_SIZE))
+    facts = (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+    fps, width, height = (capture.get(fact) for fact in facts)
     capture.release()
     if count == 0:
         bad_value(name, "a video with frames in it", f"{path}, which has none")
-    return count, fps or 30.0, (int(size[0]), int(size[1]))
-
-
-def count_frames(path: Path, name: str = "video") -> int:
-    """How many frames a video has: heads of videos are not to be relied on."""
-    return video_facts(path, name)[0]
+    return count, fps or 30.0, (int(width), int(height))
 
 
 class VideoReader(AbstractContextManager["VideoReader"]):
@@ -99,8 +93,8 @@ def both_halves(image_01: np.ndarray, name: str = "video") -> tuple[np.ndarray, 
     if width % 2:
         cure = "Or give the right view's video as RIGHT."
         bad_value(name, "both views side by side, so of even width", f"{width} pixels wide", cure)
-    left, right = np.split(image_01, 2, axis=1)
-    return np.ascontiguousarray(left), np.ascontiguousarray(right)
+    left, right = map(np.ascontiguousarray, np.split(image_01, 2, axis=1))
+    return left, right
 
 
 class Stamp(NamedTuple):
@@ -126,11 +120,11 @@ def _open_bag(path: Path) -> Any:
 
 def _connections(reader: Any, path: Path, topic: str) -> list[Any]:
     images = [c for c in reader.connections if c.msgtype.endswith(("/Image", "/CompressedImage"))]
-    named = [connection for connection in images if connection.topic == topic]
-    if not named:
-        got = f"{path}, whose images are {', '.join(sorted({c.topic for c in images})) or 'none'}"
+    topics = sorted({connection.topic for connection in images})
+    if topic not in topics:
+        got = f"{path}, whose images are {', '.join(topics) or 'none'}"
         bad_value(topic, "a topic of images in the bag", got)
-    return named
+    return [connection for connection in images if connection.topic == topic]
 
 
 def _header_stamp(raw: bytes | memoryview, is_ros2: bool) -> int:
@@ -149,7 +143,7 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
             for topic in topics:
                 messages = reader.messages(_connections(reader, path, topic))
                 stamps.append(sorted(Stamp(_header_stamp(raw, reader.is2), at) for _, at, raw in messages))
-    except ValueError:
+    except InputError:
         raise
     except Exception as error:  # of any kind that a damaged bag leads to
         said = str(error).partition("\n")[0] or type(error).__name__
@@ -171,8 +165,7 @@ class BagReader(AbstractContextManager["BagReader"]):
     """Both images of the pairs of ``list_pairs``, side by side as in a video; a context manager."""
 
     def __init__(self, path: Path, topics: tuple[str, str], tolerance_s: float) -> None:
-        self._path, self._pairs = path, list_pairs(path, topics, tolerance_s)
-        self._reader = _open_bag(path)
+        self._path, self._pairs, self._reader = path, list_pairs(path, topics, tolerance_s), _open_bag(path)
         self._reader.open()
         self._connections = [_connections(self._reader, path, topic) for topic in topics]
 
@@ -225,11 +218,14 @@ def stereo_calibration(path: Path, topics: tuple[str, str]) -> tuple[list[str], 
                 cure = "Give --calib, or the cameras in another way."
                 bad_value("calibration", f"in the bag as {base}/camera_info, or given", "neither", cure)
             info = reader.deserialize(first[2], first[0].msgtype)
-            entries: dict[str, Any] = {"image_width": int(info.width), "image_height": int(info.height)}
+            entries: dict[str, Any] = {
+                "width": info.width,
+                "height": info.height,
+                "rectified": "rect" in name,
+            }
             for key in "DKRP":  # ROS 2 has them in small letters
                 entries[key] = np.array(getattr(info, key, getattr(info, key.lower(), ())), float).tolist()
-            entries |= {"distortion_model": info.distortion_model, "rectified": "rect" in name}
-            texts.append(yaml.safe_dump(entries))
+            texts.append(yaml.safe_dump(entries | {"distortion_model": info.distortion_model}))
             frames.append(info.header.frame_id)
     return texts, frames[0]
 
@@ -250,6 +246,7 @@ def write_depth_bag(
     plugin: dict[str, Any] = {"version": 9, "storage_plugin": rosbag2.StoragePlugin.MCAP}
     kinds = {"/depth/image": "sensor_msgs/msg/Image", "/depth/camera_info": "sensor_msgs/msg/CameraInfo"}
     image_of, camera_of = (store.types[kind] for kind in kinds.values())
+    serialize = store.serialize_cdr if is_ros2 else store.serialize_ros1
     roi = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
         made = Path(folder) / "depth"
@@ -268,8 +265,7 @@ def write_depth_bag(
                 P = np.column_stack([K, np.zeros(3)])
                 matrices = [m.astype(np.float64).ravel() for m in (np.zeros(5), K, np.eye(3), P)]
                 camera = camera_of(header, *size, "plumb_bob", *matrices, 0, 0, roi)
-                for topic, kind, message in zip(topics, kinds.values(), (image, camera), strict=True):
-                    serialize = store.serialize_cdr if is_ros2 else store.serialize_ros1
-                    writer.write(topic, stamp.recorded, serialize(message, kind))
+                for topic, message in zip(topics, (image, camera), strict=True):
+                    writer.write(topic, stamp.recorded, serialize(message, message.__msgtype__))
         os.replace(made / "depth.mcap" if is_ros2 else made, path)
     return count

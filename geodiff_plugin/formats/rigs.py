@@ -54,13 +54,13 @@ class CameraChoice:
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera as a file describes it; nothing is checked yet.
+    """One camera as a file describes it, numbers or text of them; nothing is checked yet.
 
-    ``K`` is in pixels of images of ``size``, which may be unknown, the centre of the first pixel at (0, 0);
-    ``coefficients`` are in OpenCV's order, empty for no lens; ``model`` is the file's name (``LENS_MODELS``).
+    ``K``, nine numbers, is in pixels of images of ``size``, which may be unknown, the first pixel's centre at
+    (0, 0); ``coefficients`` are in OpenCV's order, empty for no lens; ``model`` is the file's name of it.
     """
 
-    K: np.ndarray
+    K: Any
     size: Any = None
     coefficients: Any = ()
     model: str = "opencv"
@@ -68,15 +68,12 @@ class Camera:
 
 @dataclass(frozen=True)
 class CalibrationFormat:
-    """One entry of ``CALIBRATION_FORMATS``.
+    """One entry of ``CALIBRATION_FORMATS``; ``summary`` names it in messages.
 
-    Attributes:
-        summary: the format, for messages.
-        mark: regular expression that its texts have, and none of a format before it; ``^`` begins a line.
-        read: the rig of the texts, by ``make_rig``; it may raise whatever a missing entry raises.
-        file_counts: how many files may describe one pair.
-        uses_cameras: whether a file may hold more than two cameras.
-        by_image: whether it has a pose, in no known unit, for each of many images, found by their names.
+    ``mark`` is a regular expression that its texts have, and none of a format before it; ``^`` begins a line.
+    ``read`` makes the rig of the texts by ``make_rig``, and may raise whatever a missing entry raises. Files
+    may be as many as ``file_counts`` says, hold more than two cameras (``uses_cameras``), or a pose in no
+    known unit for each of many images (``by_image``).
     """
 
     summary: str
@@ -87,12 +84,9 @@ class CalibrationFormat:
     by_image: bool = False
 
 
-# What readers share. Each raises ValueError with the name of the entry.
-
-
 @contextmanager
 def reading_whole(source: object, summary: str) -> Iterator[None]:
-    """Whatever is wrong in files that are read inside becomes a sentence with their names."""
+    """Whatever is wrong in the files that are read inside becomes a sentence with their names."""
     try:
         yield
     except InputFileError:
@@ -100,8 +94,7 @@ def reading_whole(source: object, summary: str) -> Iterator[None]:
     except InputError as error:
         refuse(f"{source}: {error}")
     except UNFINISHED as error:
-        said = str(error) or "other entries"
-        got = f"no {error}" if isinstance(error, KeyError) else said
+        got = f"no {error}" if isinstance(error, KeyError) else str(error) or "other entries"
         bad_value(str(source), f"a whole {summary}", got, "Is the file cut off?")
 
 
@@ -177,10 +170,21 @@ def names_of_pair(names: Collection[str], choice: CameraChoice) -> tuple[str, st
     """The names in a file of both images; they and the paths may lack folders, or a suffix."""
     if choice.image_names is None:
         bad_value("image_names", "given, as ('left.jpg', 'right.jpg'), for a file of many images", "none")
-    left, right = (_named(names, str(wanted)) for wanted in choice.image_names)
-    if left == right:
-        bad_value("the images", "two of those in the file", f"{left} for both", "Check their names.")
-    return left, right
+    found = []
+    for wanted in choice.image_names:
+        in_common = {name: _parts_in_common(name, str(wanted)) for name in names}
+        most = max(in_common.values(), default=0)
+        fitting = sorted(name for name, count in in_common.items() if count == most)
+        if most == 0:
+            expected = f"one of the {len(names)} in the file ({', '.join(sorted(names)[:3])}, ...)"
+            bad_value("the image", expected, wanted, "Check its name.")
+        if len(fitting) > 1:
+            got = f"{wanted}, which may be {' and '.join(fitting[:2])}"
+            bad_value("the image", "one image of the file", got, "Add its folder.")
+        found += fitting
+    if found[0] == found[1]:
+        bad_value("the images", "two of those in the file", f"{found[0]} for both", "Check their names.")
+    return found[0], found[1]
 
 
 def _parts_in_common(name: str, wanted: str) -> int:
@@ -192,22 +196,6 @@ def _parts_in_common(name: str, wanted: str) -> int:
         theirs[-1] = ours[-1]
     count = min(len(ours), len(theirs))
     return count if ours[len(ours) - count :] == theirs[len(theirs) - count :] else 0
-
-
-def _named(names: Collection[str], wanted: str) -> str:
-    in_common = {name: _parts_in_common(name, wanted) for name in names}
-    most = max(in_common.values(), default=0)
-    fitting = sorted(name for name, count in in_common.items() if count == most)
-    if most == 0:
-        expected = f"one of the {len(names)} in the file ({', '.join(sorted(names)[:3])}, ...)"
-        bad_value("the image", expected, wanted, "Check its name.")
-    if len(fitting) > 1:
-        got = f"{wanted}, which may be {' and '.join(fitting[:2])}"
-        bad_value("the image", "one image of the file", got, "Add its folder.")
-    return fitting[0]
-
-
-# From raw numbers to the rig.
 
 
 def is_distorted(lens: Distortion | None) -> bool:
@@ -259,12 +247,15 @@ def make_rig(left: Camera, right: Camera, pose: Any, *, rectified: bool = False)
     else:
         E = array_of(pose, (4, 4), "the pose")
     cameras = (("the left camera", left), ("the right camera", right))
-    Ks = [check_intrinsics(camera.K, f"K of {name}") for name, camera in cameras]
+    K_left, K_right = (
+        check_intrinsics(array_of(camera.K, (3, 3), f"K of {name}"), f"K of {name}")
+        for name, camera in cameras
+    )
     sizes = [_pixels(camera.size, name) for name, camera in cameras]
-    lens_left, lens_right = (lens_of(camera, name) for name, camera in cameras)
-    rectified = rectified and lens_left is lens_right is None
-    lenses = (lens_left, lens_right)
-    return Rig(Ks[0], Ks[1], E, sizes[0], sizes[1], distortion=lenses, rectified=rectified)
+    left_lens, right_lens = (lens_of(camera, name) for name, camera in cameras)
+    rectified = rectified and left_lens is right_lens is None
+    lenses = (left_lens, right_lens)
+    return Rig(K_left, K_right, E, sizes[0], sizes[1], distortion=lenses, rectified=rectified)
 
 
 def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any = None) -> Rig:
@@ -273,9 +264,8 @@ def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any 
     for side, values, size in (("left", P_left, size_left), ("right", P_right, size_right)):
         P = array_of(values, (3, 4), f"the {side} projection")
         cameras.append(Camera(check_intrinsics(P[:, :3], f"K of the {side} camera"), size))
-        places.append(np.linalg.solve(P[:, :3], P[:, 3]))
-    E = np.eye(4)
-    E[:3, 3] = places[0] - places[1]
+        places.append(np.linalg.solve(P[:, :3], P[:, 3:]))
+    E = np.vstack([np.hstack([np.eye(3), places[0] - places[1]]), (0, 0, 0, 1)])
     return make_rig(cameras[0], cameras[1], E, rectified=True)
 
 

@@ -16,7 +16,7 @@ from geodiff_plugin._checks import bad_type, bad_value, check_number
 from geodiff_plugin.algorithm.evidence import Evidence, prepare_evidence
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.formats import as_image_01
-from geodiff_plugin.formats.lenses import intrinsics_from_exif, intrinsics_from_fov
+from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.geometry import image_size, resize_intrinsics, unproject
 from geodiff_plugin.guidance.inputs import Inputs, as_points
 from geodiff_plugin.matching import clean

@@ -26,7 +26,7 @@ from geodiff_plugin._camera_checks import (
 )
 from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.formats import as_image_01, picture_size
-from geodiff_plugin.formats.lenses import warn_of_other_lens
+from geodiff_plugin.formats.images import warn_of_other_lens
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.types import CameraView, Rig
 

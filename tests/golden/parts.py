@@ -26,7 +26,7 @@ from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.schedule import make_schedule
 from geodiff_plugin.algorithm.terms import Objective, match_exposure, photometric, ssim
 from geodiff_plugin.config import DEFAULT, MARIGOLD_DC, PAPER, UpdatePlan
-from geodiff_plugin.formats.lenses import intrinsics_from_exif
+from geodiff_plugin.formats.images import intrinsics_from_exif
 from geodiff_plugin.geometry import hidden_in_right, is_rectified, project, resize_image, warp_right_to_left
 from geodiff_plugin.matching import build_cost_volume, points_to_matches, with_points
 from geodiff_plugin.matching.build import mirrored_pose_preferred

@@ -9,7 +9,7 @@ from PIL import Image
 
 from geodiff_plugin import GuidanceConfig
 from geodiff_plugin.cli.inputs import pinhole
-from geodiff_plugin.formats.lenses import distortion_from_text, undistorted
+from geodiff_plugin.formats.images import distortion_from_text, undistorted
 from geodiff_plugin.guidance.evidence import make_evidence
 from geodiff_plugin.guidance.inputs import Inputs
 from geodiff_plugin.matching import build_cost_volume, clean, match_volume

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin.formats.lenses import intrinsics_from_exif, intrinsics_from_fov
+from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.pose.estimate import estimate_pose, find_scale
 from geodiff_plugin.pose.solve import MOST_SPREAD, SCALE_PX, Prior, depth_spread, open_pose, solve_poses
 from geodiff_plugin.pose.tracks import Tracks, solve_inverse_depth
