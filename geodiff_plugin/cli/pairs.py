@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import os
-import re
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from PIL import Image
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.options import DepthOptions, check_files, told_apart
 from geodiff_plugin.cli.terminal import say
-from geodiff_plugin.formats.files import MAP_SUFFIXES, check_file, find_map
+from geodiff_plugin.formats.files import MAP_SUFFIXES, check_file, find_map, natural_order
 from geodiff_plugin.formats.out import check_out
 from geodiff_plugin.formats.recordings import VIDEOS, is_bag, is_video, list_pairs, video_facts
 
@@ -100,13 +99,7 @@ def options_of(ref: PairRef, options: DepthOptions) -> DepthOptions:
 def _photographs(folder: Path) -> list[Path]:
     Image.init()
     paths = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
-    return sorted((path for path in paths if path.suffix.lower() in Image.EXTENSION), key=_natural)
-
-
-def _natural(path: Path) -> tuple[list[str | int], str]:
-    """Sorts names as people count: f2 before f10."""
-    parts = re.split(r"([0-9]+)", path.stem)  # text and numbers in turns, so that like meets like
-    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
+    return sorted((path for path in paths if path.suffix.lower() in Image.EXTENSION), key=natural_order)
 
 
 def _of_folders(left: Path, right: Path | None) -> tuple[list[PairRef], str]:

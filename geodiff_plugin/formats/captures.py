@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from geodiff_plugin._checks import InputError, MissingFileError, bad_value
-from geodiff_plugin.formats.files import read_matrix, read_rows, read_text, upright_size
+from geodiff_plugin.formats.files import natural_order, read_matrix, read_rows, read_text, upright_size
 from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.formats.recordings import is_video, video_facts
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, lens_of, reading_whole, resized, rigid
@@ -40,7 +40,7 @@ INTRINSICS = (
     *("intrinsics.txt", "camera-intrinsics.txt", "K.txt"),
     *("intrinsic/intrinsic_color.txt", "intrinsic_color.txt"),
 )
-#: Values a metre of TUM's depth maps; all others are in millimetres.
+#: Values a metre of TUM's depth maps, others are in millimetres.
 TUM_DEPTH = 5000.0
 #: Entries of a frame by which a transforms.json says that its poses come from structure from motion.
 OF_COLMAP = ("colmap_im_id", "sharpness")
@@ -74,8 +74,8 @@ class CaptureFiles:
     notes: tuple[str, ...] = ()
 
 
-#: Intrinsics, or the horizontal field of view in degrees; and the file of a video's trajectory.
-Typed = tuple[np.ndarray | float | None, str | os.PathLike[str] | None]
+#: What was typed: K for images of a size, and the file of a video's trajectory.
+Typed = tuple[Callable[[tuple[int, int]], np.ndarray | None], str | os.PathLike[str] | None]
 
 
 def read_capture(
@@ -92,8 +92,14 @@ def read_capture(
     """
     source = Path(path)
     if not source.exists():
-        raise MissingFileError(f"PATH must be a capture; there is no {source}.")
-    typed = (fov if K is None else np.asarray(K, dtype=np.float64), trajectory)
+        bad_value("PATH", "a capture", f"{source}, which does not exist", error=MissingFileError)
+
+    def typed_K(size: tuple[int, int]) -> np.ndarray | None:
+        if K is None and fov is not None:
+            return intrinsics_from_fov(fov, size)
+        return None if K is None else np.asarray(K, dtype=np.float64)
+
+    typed = (typed_K, trajectory)
     with reading_whole(source, "capture"):
         files = next((files for read in LAYOUTS if (files := read(source, typed)) is not None), None)
     if files is None:
@@ -118,11 +124,6 @@ def read_capture(
     return CaptureFiles(tuple(frames), files.kind, files.unit if tracked else None, notes)
 
 
-def _typed_K(typed: Typed, size: tuple[int, int]) -> np.ndarray | None:
-    given = typed[0]
-    return intrinsics_from_fov(given, size) if isinstance(given, (int, float)) else given
-
-
 def _framed(
     path: Path, camera: Camera, E: np.ndarray | None, typed: Typed, depth: Path | None = None
 ) -> CaptureFrame:
@@ -130,7 +131,7 @@ def _framed(
     if not path.is_file():
         return CaptureFrame(path.stem, path, camera.K, (0, 0), E)
     size = upright_size(path, f"{path}")
-    K = _typed_K(typed, size)
+    K = typed[0](size)
     if K is None:
         K = resized(camera, size, f"{path}", "Is it a crop? Give --K.").K
     depth = depth if depth is not None and depth.is_file() else None
@@ -148,23 +149,9 @@ def _file_camera(folder: Path, published: Camera | None) -> Camera:
     return published
 
 
-def _matrix_pose(file: Path) -> np.ndarray | None:
-    """A camera-to-world matrix; ``None`` without a file, or where the tracker was lost (infinity, NaN)."""
-    try:
-        matrix = read_matrix(file, f"{file}")
-    except InputError:
-        return None
-    return rigid(matrix, f"the pose in {file}")
-
-
-def _images_in(folder: Path) -> list[Path]:
-    """Images of a folder, numbers in names in order."""
-    return sorted((path for path in folder.iterdir() if path.suffix.lower() in IMAGES), key=_natural)
-
-
-def _natural(path: Path) -> list[object]:
-    parts = re.split(r"(\d+)", path.name)
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in parts if part]
+def _images_of(paths: Iterable[Path]) -> list[Path]:
+    """The images among paths, numbers in names in order."""
+    return sorted((path for path in paths if path.suffix.lower() in IMAGES), key=natural_order)
 
 
 # A layout's reader returns None for what is none.
@@ -207,13 +194,16 @@ def _colmap(path: Path, typed: Typed) -> CaptureFiles | None:
 
 def _tracked(folder: Path, typed: Typed) -> CaptureFiles | None:
     for kind, (images, pose, depth, published) in TRACKED.items():
-        paths = sorted((p for p in folder.glob(images) if p.suffix.lower() in IMAGES), key=_natural)
+        paths = _images_of(folder.glob(images))
         if not (paths and (folder / pose).parent.is_dir()):
             continue
         camera, frames = _file_camera(folder, published), []
         for path in paths:
-            name = path.name.partition(".")[0]
-            E = _matrix_pose(folder / pose.format(name))
+            name, E = path.name.partition(".")[0], None
+            file = folder / pose.format(name)
+            with suppress(InputError):  # there is none, or the tracker was lost (infinity, NaN)
+                E = read_matrix(file, f"{file}")
+            E = None if E is None else rigid(E, f"the pose in {file}")
             frames.append(replace(_framed(path, camera, E, typed, folder / depth.format(name)), name=name))
         return CaptureFiles(tuple(frames), kind)
     return None
@@ -244,16 +234,15 @@ def _trajectory(file: Path) -> Callable[[float], np.ndarray | None]:
     with reading_whole(file, "trajectory of lines seconds tx ty tz qx qy qz qw"):
         lines = [words[:8] for words in read_rows(file, f"{file}", "a trajectory")]
         rows = array_of(lines, (-1, 8), "lines of 8")
-        rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
-        turns = Slerp(rows[:, 0], Rotation.from_quat(rows[:, 4:]))
+        times, first = np.unique(rows[:, 0], return_index=True)
+        turns, places = Slerp(times, Rotation.from_quat(rows[first, 4:])), rows[first, 1:4]
 
     def pose_at(t: float) -> np.ndarray | None:
-        if np.abs(rows[:, 0] - t).min() > FARTHEST_S:
+        if np.abs(times - t).min() > FARTHEST_S:
             return None
-        t = float(np.clip(t, rows[0, 0], rows[-1, 0]))
-        E = np.eye(4)
+        t, E = float(np.clip(t, times[0], times[-1])), np.eye(4)
         E[:3, :3] = turns(t).as_matrix()
-        E[:3, 3] = [np.interp(t, rows[:, 0], rows[:, axis]) for axis in (1, 2, 3)]
+        E[:3, 3] = [np.interp(t, times, along) for along in places.T]
         return E
 
     return pose_at
@@ -263,7 +252,7 @@ def _video(path: Path, typed: Typed) -> CaptureFiles | None:
     if not (path.is_file() and is_video(path)):
         return None
     count, fps, size = video_facts(path, "PATH")
-    K = _typed_K(typed, size)
+    K = typed[0](size)
     if K is None:
         bad_value("K", "given by --K or --fov", "none", "A video does not say its focal length.")
     pose_at = _trajectory(Path(typed[1])) if typed[1] is not None else lambda t: None
@@ -272,11 +261,11 @@ def _video(path: Path, typed: Typed) -> CaptureFiles | None:
 
 
 def _images(path: Path, typed: Typed) -> CaptureFiles | None:
-    folders = [folder for folder in (path, path / "images") if folder.is_dir() and _images_in(folder)]
+    folders = [_images_of(folder.iterdir()) for folder in (path, path / "images") if folder.is_dir()]
     frames = []
-    for image in _images_in(folders[0]) if folders else []:
+    for image in next(filter(None, folders), []):
         size = upright_size(image, f"{image}")
-        K = _typed_K(typed, size)
+        K = typed[0](size)
         K = intrinsics_from_exif(image, image.name)[0] if K is None else K
         frames.append(CaptureFrame(image.stem, image, K, size))
     return CaptureFiles(tuple(frames), "images without poses") if frames else None

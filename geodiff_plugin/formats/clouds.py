@@ -17,8 +17,8 @@ from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 
-#: Depth change from one pixel to the next, as a share of the nearer depth. At a focal length of 500 px it is
-#: a surface seen at 87 degrees from its normal: hardly a surface that one camera can see.
+#: Depth change from one pixel to the next, as a share of the nearer depth: at a focal length of 500 px of a
+#: surface seen at 87 degrees from its normal.
 RELATIVE_STEP = 0.04
 #: A corner of a flat surface has three neighbours on it, a one-pixel ramp along an edge has two.
 FEWEST_NEIGHBOURS = 3
@@ -88,14 +88,13 @@ def make_cloud(
     Raises:
         ValueError: shapes that do not fit, or a K that is none.
     """
-    parts = list(_cloud_strips(depth_m, image_01, K, valid))
-    return Cloud(np.concatenate([p.points_m for p in parts]), np.concatenate([p.colours for p in parts]))
+    return Cloud(*map(np.concatenate, zip(*_cloud_strips(depth_m, image_01, K, valid), strict=True)))
 
 
 def _cloud_strips(
     depth_m: np.ndarray, image_01: np.ndarray, K: np.ndarray, valid: np.ndarray | None
-) -> Iterator[Cloud]:
-    """The points of ``make_cloud``, a strip of rows after the other."""
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Points and colours of ``make_cloud``, a strip of rows after the other."""
     depth_m, image_01 = np.asarray(depth_m), np.asarray(image_01)
     if depth_m.ndim != 2 or image_01.shape != (*depth_m.shape, 3):
         bad_value("image_01", "(H, W, 3) over a depth of (H, W)", f"{image_01.shape} over {depth_m.shape}")
@@ -105,7 +104,7 @@ def _cloud_strips(
         use = _usable(z, None if valid is None else valid[rows])
         v, u = np.nonzero(use)
         points = np.stack([u, v + rows.start, np.ones_like(u)], axis=-1) @ unproject * z[use][:, None]
-        yield Cloud(points, np.rint(np.clip(image_01[rows][use], 0.0, 1.0) * 255.0).astype(np.uint8))
+        yield points, np.rint(np.clip(image_01[rows][use], 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def write_ply(
@@ -121,9 +120,8 @@ def write_ply(
     ``unit`` is ``"m"``, or ``None`` for a depth without one; a comment of the file says which, and the frame.
     """
     count = int(np.count_nonzero(_usable(np.asarray(depth_m), valid)))
-    strips = ((cloud.points_m, cloud.colours) for cloud in _cloud_strips(depth_m, image_01, K, valid))
-    frame = "camera frame: x right, y down, z forward"
-    write_vertices(path, frame, unit, count, (*"xyz", "red", "green", "blue"), strips)
+    frame, names = "camera frame: x right, y down, z forward", (*"xyz", "red", "green", "blue")
+    write_vertices(path, frame, unit, count, names, _cloud_strips(depth_m, image_01, K, valid))
     return count
 
 
@@ -139,11 +137,10 @@ def write_vertices(
 
     Of every part the columns of its arrays together are called ``names``: floats, the last three colours.
     """
-    kinds = ["float"] * (len(names) - 3) + ["uchar"] * 3
-    properties = [f"property {kind} {name}" for kind, name in zip(kinds, names, strict=True)]
     comment = f"comment {frame}, {'metres' if unit else 'no unit'}"
-    lines = ["ply", "format binary_little_endian 1.0", comment, f"element vertex {count}", *properties]
-    vertex = np.dtype([(n, "<f4" if kind == "float" else "u1") for kind, n in zip(kinds, names, strict=True)])
+    lines = ["ply", "format binary_little_endian 1.0", comment, f"element vertex {count}"]
+    lines += [f"property float {name}" for name in names[:-3]] + [f"property uchar {n}" for n in names[-3:]]
+    vertex = np.dtype([(name, "<f4") for name in names[:-3]] + [(name, "u1") for name in names[-3:]])
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join([*lines, "end_header\n"]).encode("ascii"))
         for part in parts:
@@ -171,9 +168,7 @@ def write_glb(
     Convention:
         glTF's axes, in metres: a point 1 m to the right of, above and before the camera is (1, 1, -1).
     """
-    accessors: list[dict[str, Any]] = []
-    views: list[dict[str, int]] = []
-    data = bytearray()
+    accessors, views, data = list[dict[str, Any]](), list[dict[str, int]](), bytearray()
 
     def add(array: np.ndarray, kind: str, target: int = ATTRIBUTES, **more: Any) -> int:
         entry = {"bufferView": len(views), "componentType": COMPONENTS[array.dtype.char]}
@@ -196,10 +191,8 @@ def write_glb(
         length_m = PYRAMID_SHARE * float(np.median(cloud.points_m[:, 2]))
     for number, (K, E, size) in enumerate(cameras):
         colours = np.tile(CAMERA_COLOURS[number % len(CAMERA_COLOURS)], (5, 1))
-        corners = _pyramid(np.asarray(K), np.asarray(E), size, length_m)
-        meshes.append(
-            mesh(f"camera {number}", LINES, corners, colours, indices=add(EDGES, "SCALAR", INDICES))
-        )
+        corners, edges = _pyramid(np.asarray(K), np.asarray(E), size, length_m), add(EDGES, "SCALAR", INDICES)
+        meshes.append(mesh(f"camera {number}", LINES, corners, colours, indices=edges))
     names = [mesh["name"] for mesh in meshes]
     scene: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "geodiff-plugin"},
@@ -218,7 +211,6 @@ def write_glb(
     text = json.dumps(scene, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<II", len(text), JSON_CHUNK) + text
-    if data:
-        chunks += struct.pack("<II", len(data), BINARY_CHUNK) + data
+    chunks += struct.pack("<II", len(data), BINARY_CHUNK) + data if data else b""
     with atomic_path(path) as temporary:
         temporary.write_bytes(struct.pack("<III", MAGIC, VERSION, 12 + len(chunks)) + chunks)

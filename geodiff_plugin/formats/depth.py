@@ -1,11 +1,9 @@
-"""Known depths: maps (PFM, npy, 16-bit PNG), points (npy, text, PLY, KITTI), disparity; strips of maps."""
+"""Known depths: maps, points, disparity; written maps are there whole or not at all; strips of maps."""
 
 from __future__ import annotations
 
 import os
 import re
-import zipfile
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -71,19 +69,16 @@ def read_pfm(path: PathLike, name: str = "map") -> np.ndarray:
         except ValueError:
             kind, width, height, scale = b"", 0, 0, 0.0
         data = stream.read()
-    if kind != b"Pf" or min(width, height) < 1:
-        expected = "a grey PFM file (Pf, size, scale)"
-        bad_value(name, expected, f"{file}, whose head is another", "Is it a PNG or npy?")
-    size = 4 * width * height
-    if len(data) < size:
-        got = f"{file} with {len(data)}"
-        bad_value(name, f"a whole PFM file of {size} bytes of data", got, "Is it cut off?")
-    values = np.frombuffer(data[:size], dtype="<f4" if scale < 0 else ">f4")
+    if kind != b"Pf" or min(width, height) < 1 or len(data) < 4 * width * height:
+        bad_value(
+            name, "a whole grey PFM file (Pf, size, scale, data)", file, "Is it cut off, or a PNG or npy?"
+        )
+    values = np.frombuffer(data, dtype="<f4" if scale < 0 else ">f4", count=width * height)
     return np.flipud(values.reshape(height, width)).astype(np.float32)
 
 
 def write_pfm(path: PathLike, values: np.ndarray) -> None:
-    """Write ``(H, W)`` floats as a little-endian portable float map, whole or not at all."""
+    """Write ``(H, W)`` floats as a little-endian portable float map."""
     values = _check_map(values)
     with atomic_path(path) as temporary:
         head = f"Pf\n{values.shape[1]} {values.shape[0]}\n-1.0\n".encode()
@@ -98,10 +93,9 @@ def _check_map(depth_m: np.ndarray) -> np.ndarray:
 
 
 def write_depth_npy(path: PathLike, depth_m: np.ndarray) -> None:
-    """Write a depth map ``(H, W)`` in metres as float32 ``.npy``, whole or not at all."""
+    """Write a depth map ``(H, W)`` in metres as float32 ``.npy``."""
     depth_m = _check_map(depth_m)
-    # An open file, since numpy appends .npy to a name that lacks it.
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:  # to a name, numpy appends .npy
         np.save(file, depth_m, allow_pickle=False)
 
 
@@ -117,7 +111,7 @@ def depth_mm(depth_m: np.ndarray) -> np.ndarray:
 
 
 def write_depth_mm(path: PathLike, depth_m: np.ndarray) -> int:
-    """Write ``depth_mm`` as a 16-bit PNG, whole or not at all; returns how many of its pixels are 0."""
+    """Write ``depth_mm`` as a 16-bit PNG; returns how many of its pixels are 0."""
     whole = depth_mm(depth_m)
     with atomic_path(path) as temporary:
         Image.fromarray(whole).save(temporary, format="PNG")
@@ -147,7 +141,7 @@ def read_map(path: PathLike, name: str = "map") -> np.ndarray:
         try:
             with open(file, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
                 values = archive["depth" if "depth" in archive.files else " ".join(archive.files)]
-        except (OSError, ValueError, EOFError, KeyError, zlib.error, zipfile.BadZipFile) as error:
+        except Exception as error:  # of any kind that a damaged file leads to
             bad_value(name, "an .npz with 'depth' or a single array", f"{file} ({error})")
     else:
         values = read_pfm(file, name) if kind == ".pfm" else read_npy(file, name, MAP_FILES)
@@ -166,10 +160,9 @@ def read_points(
 ) -> np.ndarray:
     """Read known depths of the left image: ``(H, W)`` float32 metres, 0 where unknown, or ``(N, 3)``.
 
-    A map is a 16-bit PNG of millimetres, a PFM or ``.npy`` of metres. Points are metres in the left camera's
-    frame (x right, y down, z forward): ``.npy`` or text of 3, 4 or 6 columns, or with a heading that names x,
-    y and z; ``.ply``; KITTI's velodyne ``.bin``, with its ``calibration``. ``scale`` is the units of the file
-    in a metre: 1000 for millimetres, 256 for KITTI's PNG.
+    Points are in the left camera's frame: ``.npy`` or text of 3, 4 or 6 columns, or with a heading that names
+    x, y and z; ``.ply``; KITTI's velodyne ``.bin``, with its ``calibration``. ``scale`` is the units of the
+    file in a metre: 1000 for millimetres, 256 for KITTI's PNG.
     """
     file = check_file(path, name, "a file of known depths")
     if scale is not None:
@@ -214,24 +207,18 @@ def _table(path: Path, name: str) -> np.ndarray:
     """Numbers of a text, one row a line, below one heading at most."""
     rows = read_rows(path, name, KINDS)
     heading = rows.pop(0) if rows and not NUMBER.fullmatch(rows[0][0]) else []
-    lengths = sorted({len(row) for row in rows})
-    got = f"rows of {lengths or 'no'} numbers"
-    if len(lengths) == 1:
-        columns = _columns(heading, path, name) if len(heading) == lengths[0] else range(lengths[0])
-        with suppress(ValueError):
-            return np.array([[row[column] for column in columns] for row in rows], dtype=np.float64)
-        got = "words among them"
-    bad_value(name, "points in metres, one a line, below one heading at most", f"{path} with {got}")
-
-
-def _columns(heading: list[str], path: Path, name: str) -> Sequence[int]:
-    """Where a heading with a word a column has x, y and z."""
-    words = [re.sub(r"([_ ]?m|[_ ]?[\[(]m[\])])$", "", word.lower()) for word in heading]
-    if any(words.count(axis) != 1 for axis in "xyz"):
-        cure = "Write the points as x, y and z of the left camera, or the depths as a map of the left image."
-        got = f"{path} with {', '.join(heading)}"
-        bad_value(name, "points with columns x, y and z, in metres", got, cure)
-    return [words.index(axis) for axis in "xyz"]
+    lengths = {len(row) for row in rows}
+    if lengths == {len(heading)}:  # a word a column
+        words = [re.sub(r"([_ ]?m|[_ ]?[\[(]m[\])])$", "", word.lower()) for word in heading]
+        if any(words.count(axis) != 1 for axis in "xyz"):
+            cure = "Write the points as x, y and z of the left camera, or depths as a map of the left image."
+            got = f"{path} with {', '.join(heading)}"
+            bad_value(name, "points with columns x, y and z, in metres", got, cure)
+        rows = [[row[words.index(axis)] for axis in "xyz"] for row in rows]
+    with suppress(ValueError):  # words, or rows of several lengths
+        return np.array(rows, dtype=np.float64).reshape(len(rows), -1)
+    got = f"{path} with words, or rows of {sorted(lengths)} numbers"
+    bad_value(name, "points in metres, one a line, below one heading at most", got)
 
 
 def read_ply_points(path: Path, name: str = "points") -> np.ndarray:
@@ -244,8 +231,8 @@ def read_ply_points(path: Path, name: str = "points") -> np.ndarray:
     words = properties.split()
     columns, kinds, count = words[2::3], words[1::3], int(number)
     if not {"x", "y", "z"} <= set(columns) or len(set(columns)) < len(columns) or count == 0:
-        expected = "a PLY file that begins with vertices of plain x, y and z"
-        bad_value(name, expected, f"{path}, which has none", "Is it cut off, or another format?")
+        cure = "Is it cut off, or another format?"
+        bad_value(name, "a PLY file that begins with vertices of plain x, y and z", path, cure)
     if order == "ascii":
         lines = data[begin:].decode("latin-1").splitlines()[:count]
         with suppress(ValueError):
@@ -257,8 +244,7 @@ def read_ply_points(path: Path, name: str = "points") -> np.ndarray:
         if len(data) - begin >= count * row.itemsize:
             points = np.frombuffer(data, dtype=row, count=count, offset=begin)
             return np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    expected = f"a PLY file with all its {count} points of {len(columns)} numbers"
-    bad_value(name, expected, f"{path} with others", "Is it cut off?")
+    bad_value(name, f"a PLY file with all its {count} points", f"{path} with others", "Is it cut off?")
 
 
 def _camera_from_velodyne(paths: Sequence[PathLike], name: str) -> np.ndarray:
@@ -269,24 +255,22 @@ def _camera_from_velodyne(paths: Sequence[PathLike], name: str) -> np.ndarray:
             with suppress(ValueError):  # a row of words, such as the date
                 rows[key] = np.array(words.split(), dtype=np.float64)
 
-    def matrix(height: int, width: int, *keys: str) -> np.ndarray:
-        row = next((rows[key] for key in keys if key in rows), np.empty(0))
-        if row.size != height * width or not np.isfinite(row).all():
-            bad_value(name, VELODYNE, f"files without {' or '.join(keys)} of {height * width} numbers")
-        T = np.eye(4)
-        T[:height, :width] = row.reshape(height, width)
+    def matrix(columns: slice, *keys: str) -> np.ndarray:
+        row, T = next((rows[key] for key in keys if key in rows), np.empty(0)), np.eye(4)
+        if row.size != T[:3, columns].size or not np.isfinite(row).all():
+            bad_value(name, VELODYNE, f"files without {' or '.join(keys)} of {T[:3, columns].size} numbers")
+        T[:3, columns] = row.reshape(3, -1)
         return T
 
-    rectify = matrix(3, 3, "R0_rect", "R_rect_00", "R_rect")
+    turn, shift, both = slice(0, 3), slice(3, 4), slice(0, 4)
     if "R" in rows and "T" in rows:
-        moved = matrix(3, 3, "R")
-        moved[:3, 3] = matrix(3, 1, "T")[:3, 0]
+        moved = matrix(shift, "T") @ matrix(turn, "R")
     else:
-        moved = matrix(3, 4, "Tr_velo_to_cam", "Tr_velo_cam")
-    projection = matrix(3, 4, "P2", "P_rect_02")
+        moved = matrix(both, "Tr_velo_to_cam", "Tr_velo_cam")
+    P = matrix(both, "P2", "P_rect_02")
     beside = np.eye(4)  # camera 2 stands beside camera 0, in whose frame the rest is
-    beside[:3, 3] = np.linalg.inv(check_intrinsics(projection[:3, :3], f"P2 of {name}")) @ projection[:3, 3]
-    return beside @ rectify @ moved
+    beside[:3, 3] = np.linalg.solve(check_intrinsics(P[:3, :3], f"P2 of {name}"), P[:3, 3])
+    return beside @ matrix(turn, "R0_rect", "R_rect_00", "R_rect") @ moved
 
 
 def _velodyne(path: Path, calibration: Sequence[PathLike], name: str) -> np.ndarray:
@@ -294,13 +278,11 @@ def _velodyne(path: Path, calibration: Sequence[PathLike], name: str) -> np.ndar
     if not calibration:
         cure = "The scanner has a frame of its own: x forward, y left, z up."
         bad_value(f"{name}-calib", f"given with a .bin ({VELODYNE})", "nothing", cure)
-    size = path.stat().st_size
-    if size % 16:
-        expected = "a velodyne .bin of whole points (4 float32 each)"
-        bad_value(name, expected, f"{path} of {size} bytes", "Is it cut off?")
-    scan = np.fromfile(path, dtype="<f4").reshape(-1, 4)[:, :3].astype(np.float64)
+    scan = np.fromfile(path, dtype="<f4").astype(np.float64)
+    if path.stat().st_size % 16:
+        bad_value(name, "a velodyne .bin of whole points (4 float32 each)", path, "Is it cut off?")
     T = _camera_from_velodyne(calibration, f"{name}-calib")
-    points = scan @ T[:3, :3].T + T[:3, 3]
+    points = scan.reshape(-1, 4)[:, :3] @ T[:3, :3].T + T[:3, 3]
     points = points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0)]
     if not len(points):
         bad_value(name, "a scan with points before the camera", f"{path} with none")

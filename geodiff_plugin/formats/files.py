@@ -89,6 +89,12 @@ def find_map(folder: Path, stem: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
+def natural_order(path: Path) -> tuple[list[str | int], str]:
+    """Sorts names as people count: f2 before f10."""
+    parts = re.split(r"([0-9]+)", path.stem)  # text and numbers in turns, so that like meets like
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
+
+
 def upright_size(path: str | os.PathLike[str], name: str) -> tuple[int, int]:
     """``(width, height)`` of an image file as it is read, turned by its EXIF orientation."""
     with open_image(path, name) as image:

@@ -32,8 +32,8 @@ from geodiff_plugin.formats.rigs import (
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.types import Rig
 
-#: Of a model, in the order of its numbers in binary files: how many focal lengths stand before cx cy, what
-#: ``Camera.model`` calls its lens, how many coefficients stand behind. Those that OpenCV has more are 0.
+#: Of a model, in the order of its numbers in binary files: how many focal lengths stand before cx cy, its
+#: lens as ``Camera.model``, how many coefficients stand behind. Those that OpenCV has more are 0.
 MODELS = {
     "SIMPLE_PINHOLE": (1, "opencv", 0),
     "PINHOLE": (2, "opencv", 0),
@@ -55,7 +55,7 @@ MARK = rf"{CAMERAS_MARK}|{IMAGES_MARK}|^\d+ (?:{'|'.join(MODELS)}) \d+ \d+ .|{IM
 LONGEST_HEAD = 200
 #: Of an image: its number, ``(4, 4)`` T_camera_from_world, its camera's number.
 Posed = tuple[int, np.ndarray, int]
-#: A start for other programs, not a copy of the cloud: text of a million points is 50 MB.
+#: A start for other programs: text of a million points is 50 MB.
 MOST_POINTS = 100_000
 #: Points that fewer images see, or that lie further off in pixels, are no known depths.
 FEWEST_VIEWS, MOST_ERROR_PX = 3, 1.5
@@ -91,24 +91,20 @@ def _calibration_text(path: Path, size: int, changed_ns: int) -> str:
 
 
 class _Bytes:
-    """Reads little-endian numbers of a file, one group after the other."""
+    """Reads little-endian numbers of a file, one group after the other; ``"z"`` is a text up to a zero."""
 
     def __init__(self, path: Path) -> None:
         self._data, self._at, self._path = path.read_bytes(), 0, path
 
     def __call__(self, layout: str) -> tuple[Any, ...]:
+        if layout == "z":
+            layout = f"{self._data.find(0, self._at) - self._at}sx"
         try:
             numbers = struct.unpack_from(f"<{layout}", self._data, self._at)
         except struct.error:
             bad_value(f"{self._path}", "a binary COLMAP file", "less than it says it holds", "Is it cut off?")
         self._at += struct.calcsize(f"<{layout}")
         return numbers
-
-    def name(self) -> str:
-        """The text up to the next zero."""
-        end = self._data.find(b"\0", self._at)
-        (text,) = self(f"{(end if end >= 0 else len(self._data)) - self._at}sx")
-        return str(text.decode("utf-8", errors="replace"))
 
 
 def _binary_cameras(path: Path) -> Iterator[str]:
@@ -126,9 +122,9 @@ def _binary_images(path: Path) -> Iterator[str]:
     take = _Bytes(path)
     for _ in range(*take("Q")):
         number, *pose, camera = take("I7dI")
-        name, (points,) = take.name(), take("Q")
+        (name,), (points,) = take("z"), take("Q")
         take(f"{24 * points}x")
-        yield f"{number} {' '.join(map(repr, pose))} {camera} {name}"
+        yield f"{number} {' '.join(map(repr, pose))} {camera} {name.decode(errors='replace')}"
 
 
 def _cameras(text: str) -> dict[int, Camera]:
@@ -167,28 +163,27 @@ def read_colmap_points(folder: Path) -> dict[int, np.ndarray]:
     """The reliable points ``(n, 3)`` that an image of a model sees, by its number, in the model's world."""
     path = folder / "points3D.txt"
     rows = _text_points(path) if path.exists() else _binary_points(path.with_suffix(".bin"))
-    seen: dict[int, list[tuple[float, ...]]] = {}
-    for numbers, images in rows:
-        x, y, z, error_px = map(float, numbers)
-        if len(images) >= FEWEST_VIEWS and error_px <= MOST_ERROR_PX:
+    seen: dict[int, list[Sequence[Any]]] = {}
+    for xyz, error_px, images in rows:
+        if len(images) >= FEWEST_VIEWS and float(error_px) <= MOST_ERROR_PX:
             for image in set(images):
-                seen.setdefault(int(image), []).append((x, y, z))
+                seen.setdefault(int(image), []).append(xyz)
     return {image: array_of(points, (-1, 3), f"points of {path}") for image, points in seen.items()}
 
 
-def _text_points(path: Path) -> Iterator[tuple[Sequence[Any], Sequence[Any]]]:
+def _text_points(path: Path) -> Iterator[tuple[Sequence[Any], Any, Sequence[Any]]]:
     with path.open(encoding="utf-8") as file:
         for line in file:
             words = line.split()
             if words and not line.startswith("#"):
-                yield (*words[1:4], *words[7:8]), words[8::2]
+                yield words[1:4], words[7], words[8::2]
 
 
-def _binary_points(path: Path) -> Iterator[tuple[Sequence[Any], Sequence[Any]]]:
+def _binary_points(path: Path) -> Iterator[tuple[Sequence[Any], Any, Sequence[Any]]]:
     take = _Bytes(check_file(path, "the model", "points3D.txt or points3D.bin"))
     for _ in range(*take("Q")):
-        x, y, z, error_px, seen = take("8x3d3xdQ")
-        yield (x, y, z, error_px), take(f"{2 * seen}I")[::2]
+        *xyz, error_px, seen = take("8x3d3xdQ")
+        yield xyz, error_px, take(f"{2 * seen}I")[::2]
 
 
 def read_colmap(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
@@ -233,14 +228,14 @@ def _nerf_lens(frame: Frame) -> tuple[str, list[float]]:
     return model, [numbers[key] for key in coefficients]
 
 
-def _focal_px(frame: Frame, axis: str, side: float) -> float | None:
-    """The focal length of one axis, or ``None`` where the file leaves it to the other one."""
-    angle = frame.get(f"camera_angle_{axis}")
-    if f"fl_{axis}" in frame or angle is None:
-        return frame.get(f"fl_{axis}")
+def _focal_px(frame: Frame, axis: str, side: float) -> list[float]:
+    """The focal length of one axis; none where the file leaves it to the other one."""
+    key, angle = f"fl_{axis}", frame.get(f"camera_angle_{axis}")
+    if key in frame or angle is None:
+        return [frame[key]] if key in frame else []
     if not 0 < angle < math.pi:
         bad_value(f"camera_angle_{axis}", "in radians, between 0 and pi", angle, "Is it in degrees?")
-    return 0.5 * side / math.tan(0.5 * angle)
+    return [0.5 * side / math.tan(0.5 * angle)]
 
 
 def nerf_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> Camera:
@@ -249,11 +244,10 @@ def nerf_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> Came
     if size is None:
         cure = "Give image_size, the (width, height) of the images."
         bad_value("the file", "one with entries 'w' and 'h'", "none", cure)
-    focals = [_focal_px(frame, axis, float(side)) for axis, side in zip("xy", size, strict=True)]
-    given = [focal for focal in focals if focal is not None]
-    if not given:
+    focals = _focal_px(frame, "x", float(size[0])) + _focal_px(frame, "y", float(size[1]))
+    if not focals:
         bad_value("the file", "one with an entry 'fl_x' or 'camera_angle_x'", "none")
-    K = intrinsics(given[0], given[-1], frame.get("cx", size[0] / 2), frame.get("cy", size[1] / 2))
+    K = intrinsics(focals[0], focals[-1], frame.get("cx", size[0] / 2), frame.get("cy", size[1] / 2))
     K[:2, 2] -= 0.5  # as COLMAP, both programs put the centre of the first pixel at (0.5, 0.5)
     model, coefficients = _nerf_lens(frame)
     return Camera(K, size, coefficients, model)
@@ -269,8 +263,7 @@ def nerf_pose(frame: Frame) -> np.ndarray:
 def read_nerf(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """The two images of ``choice.image_names``, in the unit of the poses.
 
-    Source: data conventions of nerfstudio's documentation, its ``colmap_utils.py`` and ``cameras.py`` (rays
-        through pixel + 0.5); ``nerf_loader.cu`` of instant-ngp.
+    Source: nerfstudio's data conventions and ``cameras.py`` (rays through pixel + 0.5); instant-ngp.
     """
     frames = nerf_frames(texts[0])
     left, right = (frames[name] for name in names_of_pair(frames, choice))
@@ -291,18 +284,15 @@ def write_colmap(
     cloud: Cloud,
     seen: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> None:
-    """Write a text model into an existing folder, for splatting and MVS.
+    """Write a text model into an existing folder, for splatting and MVS; poses are world-to-camera there.
 
-    ``views`` has ``(name, K, E, (width, height))`` of every image: no blanks in names, E camera-to-world.
-    ``seen`` has of every image the pixels ``(n, 2)`` at which it sees points, and their rows ``(n,)`` in the
-    cloud; without it at most 100 000 points are written, without tracks.
+    ``views`` has ``(name, K, E, (width, height))`` of every image: no blanks in names, E camera-to-world, the
+    first pixel's centre at (0, 0), which is (0.5, 0.5) in the file. ``seen`` has of every image the pixels
+    ``(n, 2)`` at which it sees points, and their rows ``(n,)`` in the cloud; without it at most 100 000
+    points are written, without tracks.
 
     Raises:
-        ValueError: a name with a blank.
-        OSError: the folder does not exist or is not writable.
-
-    Convention:
-        World-to-camera, and the centre of the first pixel at (0.5, 0.5): half a pixel more than in K.
+        ValueError, OSError: a name with a blank; a folder that does not exist or is not writable.
     """
     check_colmap_names([name for name, *_ in views])
     cloud = cloud.thinned(MOST_POINTS) if seen is None else cloud
@@ -312,11 +302,11 @@ def write_colmap(
     points = ["# 3D point list with POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
     tracks = [""] * len(cloud.points_m)
     for number, ((name, K, E, (width, height)), (px, rows)) in enumerate(zip(views, seen, strict=True), 1):
-        fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
-        cameras.append(f"{number} PINHOLE {width} {height} {fx:.9g} {fy:.9g} {cx:.9g} {cy:.9g}")
+        numbers = " ".join(f"{v:.9g}" for v in (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
+        cameras.append(f"{number} PINHOLE {width} {height} {numbers}")
         T = np.linalg.inv(E)
         qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat()
-        numbers = " ".join(f"{value:.12g}" for value in (qw, qx, qy, qz, *T[:3, 3]))
+        numbers = " ".join(f"{v:.12g}" for v in (qw, qx, qy, qz, *T[:3, 3]))
         images.append(f"{number} {numbers} {number} {name}")
         each = zip(px + 0.5, rows, strict=True)
         images.append(" ".join(f"{x:.3f} {y:.3f} {row + 1}" for (x, y), row in each))

@@ -64,10 +64,6 @@ Entries = dict[str, Any]
 Sockets = dict[int, Entries]
 
 
-def _numbers_of(entries: Entries, *keys: str) -> list[Any]:
-    return [entries[key] for key in keys]
-
-
 def read_middlebury(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """``doffs = cx1 - cx0`` is what the ground truth was made with, so it goes before ``cam1``."""
     entries = dict(ENTRY.findall(texts[0]))
@@ -101,7 +97,7 @@ def read_stereodemo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     data = json.loads(texts[0])
     size = data.get("width"), data.get("height")
     columns = ("cx", "cx") if "cx" in data else ("cx0", "cx1")
-    left, right = (Camera(intrinsics(*_numbers_of(data, "fx", "fy", cx, "cy")), size) for cx in columns)
+    left, right = (Camera(intrinsics(data["fx"], data["fy"], data[cx], data["cy"]), size) for cx in columns)
     return make_rig(left, right, data["baseline_meters"])
 
 
@@ -156,7 +152,7 @@ def read_zed(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         section = sections[f"{side}_CAM_{name}"]
         lens = sections.get(f"{side}_DISTO", {}) | section
         keys = ZED_LENS if lens.keys() & set(ZED_LENS[5:]) else ZED_LENS[:5]
-        K = intrinsics(*_numbers_of(section, "fx", "fy", "cx", "cy"))
+        K = intrinsics(*(section[key] for key in ("fx", "fy", "cx", "cy")))
         cameras.append(Camera(K, ZED_SIZES[name], [lens.get(key, 0.0) for key in keys]))
     # Keys are small here; per resolution in some files (TY_HD), once for all in others (TY).
     stereo, at = sections["STEREO"], f"_{name.lower()}"
@@ -169,7 +165,7 @@ def read_zed(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 
 def _rs_camera(values: Entries) -> Camera:
     """A camera of rs2's entries; a lens of coefficients 0 is none, whatever its model."""
-    K = intrinsics(*_numbers_of(values, "fx", "fy", "ppx", "ppy"))
+    K = intrinsics(*(values[key] for key in ("fx", "fy", "ppx", "ppy")))
     coefficients = array_of(values.get("coeffs", ()), (-1,), "coeffs")
     model = re.sub(r"^.*distortion|[^a-z0-9]", "", str(values.get("model", "none")).lower())
     model = {"4": "brownconrady", "5": "kannalabrandt4"}.get(model, model)  # the numbers of rs2_distortion
@@ -250,7 +246,7 @@ def _oak_links(cameras: Sockets, socket: int) -> dict[int, np.ndarray]:
         socket = link["toCameraSocket"]
         if socket not in cameras or socket in reached:
             return reached
-        shift_cm = array_of(_numbers_of(link["translation"], *"xyz"), (3,), where)
+        shift_cm = array_of([link["translation"][axis] for axis in "xyz"], (3,), where)
         T = transform(link["rotationMatrix"], shift_cm / CM_PER_METRE, where) @ T
         reached[socket] = T
 
