@@ -8,18 +8,11 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_type, bad_value, warn
 
-#: A baseline longer than this is taken for millimetres that were meant as metres (with a warning).
-LONG_BASELINE_M = 20.0
-#: A scene all of which lies further away than this may be one in centimetres or millimetres.
-FAR_SCENE_M = 200.0
-#: Known depths all of which are further than this, or that are whole numbers of such a size, may be
-#: millimetres.
-FAR_POINTS_M = 100.0
-#: A principal point in the outer fifth of an image is rather that of an image of another size.
-NEAR_BORDER = 0.2
-#: A principal point this far off the middle, in shares of the image, by nearly the same share both ways, is
-#: rather that of an image of another size: no rig of ours has one, and a crop that moves both alike is rare.
-OFF_MIDDLE, NEARLY_ALIKE = 0.12, 0.08
+#: A longer baseline, a scene or known depths all of which are further may be in millimetres.
+LONG_BASELINE_M, FAR_SCENE_M, FAR_POINTS_M = 20.0, 200.0, 100.0
+#: A principal point in the outer fifth of an image is rather that of an image of another size; so is one this
+#: far off the middle, in shares of the image, by nearly the same share both ways: few crops move both alike.
+NEAR_BORDER, OFF_MIDDLE, NEARLY_ALIKE = 0.2, 0.12, 0.08
 #: Pixels are about square; a stretched image has them up to 16:9, and a mistyped digit beyond.
 STRETCHED = 2.0
 SCALED_K = "with s = new size / old size take fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy"
@@ -93,10 +86,7 @@ def check_size_of(K: np.ndarray, size: tuple[int, int], name: str, image: str) -
 
 
 def check_pose(E: Any, name: str = "E", cure: str = POSE) -> np.ndarray:
-    """A ``(4, 4)`` float64 rigid transform; a rotation off by at most 1e-2 is projected to the nearest one.
-
-    A 3x4 gets the row 0 0 0 1; what is not finite, no rotation or mirrored is refused, with ``cure``.
-    """
+    """A ``(4, 4)`` float64 rigid transform; a rotation off by at most 1e-2 becomes the nearest one."""
     E = _as_matrix(E, name, cure, (4, 4), (3, 4))
     if len(E) == 3:
         E = np.vstack([E, (0.0, 0.0, 0.0, 1.0)])
@@ -119,8 +109,8 @@ def check_baseline(E: np.ndarray, name: str, unit: str | None) -> None:
     baseline = float(np.linalg.norm(E[:3, 3]))
     if baseline < 1e-6:
         expected = "a pose whose camera centre differs from the left one's (a baseline)"
-        cure = "Without a baseline two views do not tell the scale; give the distance between the cameras in "
-        bad_value(name, expected, f"a translation of {baseline:.1g} m", cure + "metres.")
+        cure = "Without it two views do not tell the scale; give the distance between the cameras in metres."
+        bad_value(name, expected, f"a translation of {baseline:.1g} m", cure)
     if unit == "m" and baseline > LONG_BASELINE_M:
         cure = "If that is millimetres, divide the translation, or baseline_m (--baseline), by 1000."
         warn(f"{name} has a baseline of {baseline:.4g} m. {cure}", doubt=True)

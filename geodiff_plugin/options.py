@@ -40,10 +40,9 @@ def declare(
 ) -> Any:
     """A field of a dataclass of options: its default, ``MISSING`` where it must be given, and its help.
 
-    ``flags`` are as typed, where that is not ``--name-with-dashes``, ``""`` for an argument without a name;
-    ``panel`` is the heading in the help, ``metavar`` what it calls the value. A number lies between ``low``
-    and ``high``, or is finite and above 0, in the unit ``above_0``; ``choices`` are all values besides
-    ``None``. A tuple is typed with commas where ``split``, otherwise its option is repeated.
+    ``flags`` are as typed, where that is not ``--name-with-dashes``, ``""`` for an argument without a name. A
+    number lies between ``low`` and ``high``, or is finite and above 0, in the unit ``above_0``. A tuple is
+    typed with commas where ``split``, otherwise its option is repeated.
     """
     metadata = {"help": help_text, "flags": flags, "panel": panel, "split": split, "metavar": metavar}
     metadata |= {"low": low, "high": high, "above_0": above_0, "choices": choices}
@@ -63,10 +62,7 @@ def help_of(name: str) -> str:
 
 
 def check_options(options: Any, name_of: Callable[[Field[Any]], str] = flag_of) -> None:
-    """Hold every value of a dataclass of options against what its field declares.
-
-    ``name_of`` is what a message calls a field. Fields that were not made by ``declare`` are left alone.
-    """
+    """Hold every value of a dataclass of options against what its field declares, if ``declare`` made it."""
     for field in dataclasses.fields(options):
         rules, value, name = field.metadata, getattr(options, field.name), name_of(field)
         for entry in value if isinstance(value, tuple) else (value,):

@@ -83,10 +83,8 @@ def make_cloud(
     """The points of a depth map, one a pixel, row by row; none where it is not finite or not above 0.
 
     ``depth_m`` is ``(H, W)`` metres along z, ``image_01`` ``(H, W, 3)`` in [0, 1], ``K`` ``(3, 3)`` pixels of
-    this grid, ``valid`` ``(H, W)`` boolean. A pixel on the principal point at 2 m is (0, 0, 2).
-
-    Raises:
-        ValueError: shapes that do not fit, or a K that is none.
+    this grid, ``valid`` ``(H, W)`` boolean. A pixel on the principal point at 2 m is (0, 0, 2). Raises
+    ``ValueError`` for shapes that do not fit, or a K that is none.
     """
     return Cloud(*map(np.concatenate, zip(*_cloud_strips(depth_m, image_01, K, valid), strict=True)))
 
@@ -163,10 +161,8 @@ def write_glb(
 ) -> None:
     """Write a cloud, which may be empty, and its cameras as GLB, whole or not at all.
 
-    ``cameras`` has ``(K, E, (width, height))`` of those to draw, E the pose in the left camera's frame.
-
-    Convention:
-        glTF's axes, in metres: a point 1 m to the right of, above and before the camera is (1, 1, -1).
+    ``cameras`` has ``(K, E, (width, height))`` of those to draw, E the pose in the left camera's frame. In
+    glTF's axes, in metres, a point 1 m to the right of, above and before the camera is (1, 1, -1).
     """
     accessors, views, data = list[dict[str, Any]](), list[dict[str, int]](), bytearray()
 

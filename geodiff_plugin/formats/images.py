@@ -101,13 +101,7 @@ def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
 
 
 def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.ndarray, list[str]]:
-    """Read an image file, upright: ``(H, W, 3)`` float32 in [0, 1], and sentences about what was done to it.
-
-    Alpha is dropped, the image turned as its EXIF orientation says, and of several frames the first is taken.
-
-    Raises:
-        OSError, ValueError: no readable file; not an image, cut off, or a side under 32 pixels.
-    """
+    """An image file, upright, ``(H, W, 3)`` float32 in [0, 1], and sentences about what was done to it."""
     with open_image(path, name) as image:
         notes = _file_notes(image, name)
         image.seek(0)
@@ -161,10 +155,6 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
 
     ``value`` is a PIL image, as it lies in memory; numpy ``(H, W, C)`` or ``(H, W)``, or torch ``(C, H, W)``,
     of uint8, uint16 or float in [0, 1]. One channel is repeated, a fourth dropped with a warning.
-
-    Raises:
-        TypeError: none of these types.
-        ValueError: wrong rank or channels, NaN or infinity, floats outside [0, 1], a side under 32 pixels.
     """
     if isinstance(value, Image.Image):
         notes = _file_notes(value, name)
@@ -189,11 +179,7 @@ def intrinsics_from_fov(fov_deg: float, size: tuple[int, int]) -> np.ndarray:
 def intrinsics_from_exif(
     source: str | os.PathLike[str] | Image.Image, name: str
 ) -> tuple[np.ndarray, list[str]]:
-    """K of a photograph, to a few per cent, and sentences about what was assumed.
-
-    Of a file for its upright pixels, of an image in memory for its pixels as they lie; refused without a
-    focal length, or where the image was cropped since.
-    """
+    """K of a photograph to a few per cent, of a file upright, of an image as it lies; what was assumed."""
     if not isinstance(source, Image.Image):
         with open_image(source, name) as image:
             K, notes = intrinsics_from_exif(image, name)
@@ -271,14 +257,11 @@ def undistorted(image_01: np.ndarray, K: np.ndarray, distortion: Distortion) -> 
 
 
 def undistorted_pixels(pixels: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
-    """Where pixels ``(N, 2)`` of the image as taken lie in that of ``undistorted``, with the same K.
-
-    Float64, x and y, also outside of the image; NaN where the model sends no ray to a pixel.
-    """
+    """Where pixels ``(N, 2)`` of the image as taken lie in that of ``undistorted``; NaN without a ray."""
     taken, K = np.asarray(pixels, np.float64).reshape(-1, 1, 2), np.asarray(K, np.float64)
     if not len(taken):
         return taken[:, 0]
-    coefficients, still = np.asarray(distortion.coefficients, np.float64), np.zeros(3)
+    coefficients, none = np.asarray(distortion.coefficients, np.float64), np.zeros(3)
     if distortion.model == "fisheye":
         straight = cv2.fisheye.undistortPoints(taken, K, coefficients, R=np.eye(3), P=K, criteria=UNTIL)
         rays = cv2.convertPointsToHomogeneous(straight) @ np.linalg.inv(K).T
@@ -286,7 +269,7 @@ def undistorted_pixels(pixels: np.ndarray, K: np.ndarray, distortion: Distortion
     else:
         straight = cv2.undistortImagePoints(taken, K, coefficients, None, UNTIL)
         rays = cv2.convertPointsToHomogeneous(straight) @ np.linalg.inv(K).T
-        back = cv2.projectPoints(rays, still, still, K, coefficients)[0]
+        back = cv2.projectPoints(rays, none, none, K, coefficients)[0]
     found = np.abs(back - taken).max(axis=2) < TOLERANCE_PX
     return np.where(found, straight[:, 0], np.nan)
 

@@ -89,10 +89,15 @@ def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
         bad_value("calibration", "files of one format", " and ".join(sorted(names)) or "none")
     entry = CALIBRATION_FORMATS[names.pop()]
     if len(texts) not in entry.file_counts:
-        count, cure = "one file", "It describes both cameras; give it once."
-        if len(texts) < min(entry.file_counts):
-            count, cure = "two files", "Give --calib twice, for the left and the right view."
-        bad_value("calibration", f"{count} ({entry.summary})", " and ".join(map(str, texts)), cure)
+        counts = " or ".join(map(str, entry.file_counts))
+        twice = "Give --calib twice, for the left and the right view."
+        cure = twice if len(texts) == 1 else "A file of both cameras is given once."
+        bad_value(
+            "calibration",
+            f"as many files as {entry.summary} has: {counts}",
+            " and ".join(map(str, texts)),
+            cure,
+        )
     return entry
 
 

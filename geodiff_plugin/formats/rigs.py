@@ -54,10 +54,9 @@ class CameraChoice:
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera as a file describes it, numbers or text of them; nothing is checked yet.
+    """One camera as a file describes it, in numbers or text; the first pixel's centre is at (0, 0).
 
-    ``K``, nine numbers, is in pixels of images of ``size``, which may be unknown, the first pixel's centre at
-    (0, 0); ``coefficients`` are in OpenCV's order, empty for no lens; ``model`` is the file's name of it.
+    ``coefficients`` of the lens are in OpenCV's order; ``model`` is what the file calls it.
     """
 
     K: Any
@@ -283,9 +282,7 @@ def rig_from_parameters(
 
     ``fx fy cx cy`` are in pixels of both images, the centre of the first pixel at 0; ``cx_right`` is the
     right one's (``doffs``), which stands ``baseline_m`` metres to the right. ``size`` is (width, height).
-
-    Raises:
-        TypeError, ValueError: not finite numbers, or not above 0 where they must be.
+    Raises ``TypeError`` or ``ValueError`` for what is no finite number, or not above 0 where it must be.
     """
     for name, value, unit in (("fx", fx, "pixels"), ("fy", fy, "pixels"), ("baseline", baseline_m, "metres")):
         check_positive(value, name, unit)

@@ -248,7 +248,7 @@ def nerf_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> Came
     if not focals:
         bad_value("the file", "one with an entry 'fl_x' or 'camera_angle_x'", "none")
     K = intrinsics(focals[0], focals[-1], frame.get("cx", size[0] / 2), frame.get("cy", size[1] / 2))
-    K[:2, 2] -= 0.5  # as COLMAP, both programs put the centre of the first pixel at (0.5, 0.5)
+    K[:2, 2] -= 0.5  # as COLMAP, nerfstudio (cameras.py) and instant-ngp have the first centre at (0.5, 0.5)
     model, coefficients = _nerf_lens(frame)
     return Camera(K, size, coefficients, model)
 
@@ -261,10 +261,7 @@ def nerf_pose(frame: Frame) -> np.ndarray:
 
 
 def read_nerf(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """The two images of ``choice.image_names``, in the unit of the poses.
-
-    Source: nerfstudio's data conventions and ``cameras.py`` (rays through pixel + 0.5); instant-ngp.
-    """
+    """The two images of ``choice.image_names``, in the unit of the poses."""
     frames = nerf_frames(texts[0])
     left, right = (frames[name] for name in names_of_pair(frames, choice))
     E = np.linalg.inv(nerf_pose(left)) @ nerf_pose(right)
@@ -289,10 +286,7 @@ def write_colmap(
     ``views`` has ``(name, K, E, (width, height))`` of every image: no blanks in names, E camera-to-world, the
     first pixel's centre at (0, 0), which is (0.5, 0.5) in the file. ``seen`` has of every image the pixels
     ``(n, 2)`` at which it sees points, and their rows ``(n,)`` in the cloud; without it at most 100 000
-    points are written, without tracks.
-
-    Raises:
-        ValueError, OSError: a name with a blank; a folder that does not exist or is not writable.
+    points are written, without tracks. Raises ``ValueError`` for a name with a blank.
     """
     check_colmap_names([name for name, *_ in views])
     cloud = cloud.thinned(MOST_POINTS) if seen is None else cloud

@@ -138,9 +138,7 @@ def read_mvsnet(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 def read_zed(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """The raw images of ``SN<number>.conf`` at the resolution of ``choice.image_size``; millimetres.
 
-    ``R = Rodrigues(RX, CV, RZ)`` takes left directions to right ones: ``x_right = R x_left - T``.
-
-    Source: calibration.hpp of stereolabs/zed-opencv-native.
+    ``x_right = Rodrigues(RX, CV, RZ) x_left - T``. Source: calibration.hpp of stereolabs/zed-opencv-native.
     """
     parser = configparser.ConfigParser(strict=False, interpolation=None)
     parser.read_string(texts[0])
@@ -252,11 +250,7 @@ def _oak_links(cameras: Sockets, socket: int) -> dict[int, np.ndarray]:
 
 
 def read_oak(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """The rectified images, at ``choice.image_size``, or the cameras as they stand.
-
-    Where the file holds the rectifying rotations, both images have the right camera's K, as ``StereoDepth``
-    makes them.
-    """
+    """The cameras as they stand, or, by rectifying rotations, ``StereoDepth``'s, with the right one's K."""
     data = json.loads(texts[0])
     cameras: Sockets = dict(data["cameraData"])  # pairs of a socket and its camera
     stereo = data.get("stereoRectificationData") or {}
@@ -406,10 +400,7 @@ def _orb_camera(entries: Entries, name: str, kind: str) -> Camera:
 
 
 def read_orb_slam(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """The images as taken, by ``Stereo.T_c1_c2`` (or ``Tlr``), else rectified images of one K, in metres.
-
-    ``Camera.newWidth`` is what ORB-SLAM shrinks images to, and is not read.
-    """
+    """The images as taken, by ``Stereo.T_c1_c2`` (or ``Tlr``), else rectified images of one K, in metres."""
     entries = _storage(texts[0])
     kind = entries.get("camera.type", "PinHole")
     left = "Camera1" if "camera1.fx" in entries else "Camera"
@@ -486,10 +477,7 @@ def _lenses(arrays: Arrays, named: Entries) -> list[Any]:
 
 
 def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """``P1, P2`` of the rectified images, else ``M1, M2, R, T`` and ``D1, D2``; ``NAMES`` has other names.
-
-    Lengths are taken as metres: OpenCV keeps the unit of the chessboard's squares, and no file says it.
-    """
+    """``P1, P2`` of rectified images, else ``M1, M2, R, T`` and ``D1, D2``; lengths are taken as metres."""
     arrays = [item for text in texts for item in _storage(text).items() if isinstance(item[1], np.ndarray)]
     named = _named(arrays)
     sides = np.array([named[name].item() for name in NUMBERS if name in named])

@@ -136,7 +136,7 @@ REFUSALS = [
     ("booster", "</opencv_storage>", "", "must be a whole Booster xml"),
     ("mvsnet", "extrinsic\n1.0", "extrinsic\n1.1", "extrinsic must be rigid: .*scale"),
     ("mvsnet", "0.0 0.0 0.0 1.0\n\nintrinsic", "1.0 0.0 0.0 1.0\n\nintrinsic", "last row .*transposed"),
-    ("mvsnet", "\nintrinsic", "\nextra", "intrinsic must be 9 finite numbers; got 0"),
+    ("mvsnet", "\nintrinsic", "\nextra", "K of the right camera must be 9 finite numbers; got 0"),
     ("zed", "fx=700.0", "fx=x", "fx, fy, cx, cy must be 4 finite numbers; got .'x'"),
     ("zed", "k1=0.0", "k1=-0.17", "Lens distortion of the left camera .* Undistort"),
     ("zed", "TY=", "TX=", "Baseline, TY, TZ of .STEREO. must be 3 finite numbers"),
@@ -144,8 +144,8 @@ REFUSALS = [
     ("realsense_printed", 'To  "Infrared 2"', 'To  "Depth"', "with .Infrared 1.*less.*cut off"),
     ("oak", '"toCameraSocket": 2', '"toCameraSocket": -1', "a way from socket 1 to 2"),
     ("ros", "  - 91.0\n", "  - 175.0\n", "the same in both. These are of single cameras"),
-    ("ros", "projection_matrix:", "projektion:", r"camera_info with projection_matrix \(or P\)"),
-    ("all:ros_echo", "p: [", "p: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0] # [", "not calibrated: .* all zeros"),
+    ("ros", "projection_matrix:", "projektion:", "projection_matrix must be 12 finite numbers; got None"),
+    ("all:ros_echo", "p: [", "p: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0] # [", "positive focal lengths in pixels; got 0 and 0"),
     ("kalibr", "camera_model: pinhole", "camera_model: omni", "camera_model must be pinhole; got 'omni'"),
     ("kalibr", "cam1:", "cam3:", "two different cameras of the file .0.; got 0,1"),
     ("kalibr", "radtan", "fov", "lens model.*got fov.*undistort"),
@@ -209,16 +209,14 @@ def test_how_many_files_a_format_needs(tmp_path):
     for wrong in (3, (1, 2), None):
         with pytest.raises(TypeError, match="calibration must be a path"):
             read_calibration(wrong)
-    with pytest.raises(InputError, match="3 files"):
-        read_calibration(("a", "b", "c"))
     K, text = SAMPLES["foundation_stereo"][0], SAMPLES["opencv"][0]
     path = written(tmp_path, (K,))
     assert read_calibration((path, path)).E[0, 3] == 0.12  # the same file twice is that file
     for texts, said in (
-        ((K, K.replace("0.12", "0.2")), "describes both cameras"),
+        ((K, K.replace("0.12", "0.2")), "is given once"),
         ((text, text.replace("700.0", "701.0")), "M1 must be there once; got m1, m1, which differ"),
-        ((K, SAMPLES["middlebury"][0]), "two files of one format; got foundation_stereo and middlebury"),
-        *(((SAMPLES[name][0],), "two files .*Give --calib twice") for name in ("mvsnet", "ros", "colmap")),
+        ((K, SAMPLES["middlebury"][0]), "files of one format; got foundation_stereo and middlebury"),
+        *(((SAMPLES[name][0],), "has: 2; .*Give --calib twice") for name in ("mvsnet", "ros", "colmap")),
     ):
         with pytest.raises(InputError, match=said):
             of.read_texts(tmp_path, *texts)
