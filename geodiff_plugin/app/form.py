@@ -150,11 +150,9 @@ def build_form(priors: Priors) -> Form:
     """Draw the fields into the open gradio context."""
     names = ", ".join(label.lower() for label in EXAMPLES.values())
     gr.HTML(f'<div class="legend-caption">Try an example, rendered by this project: {names}.</div>')
+    pictures = [(f"{place / 'left'}.{end}", label.split(",")[0]) for (place, end), label in EXAMPLES.items()]
     examples = gr.Gallery(
-        [
-            (str(folder / f"left.{ending}"), label.split(",")[0])
-            for (folder, ending), label in EXAMPLES.items()
-        ],
+        pictures,
         label="Examples: one click runs one",
         show_label=False,
         columns=len(EXAMPLES),

@@ -24,13 +24,10 @@ SESSIONS_KEPT = 200
 LARGEST_FILE = "40mb"
 
 
-class _OwnOnly:
+def _own_only(app: Any) -> Any:
     """ASGI middleware: adds the policy to every page, and refuses requests that another site's page makes."""
 
-    def __init__(self, app: Any) -> None:
-        self.app = app
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+    async def served(scope: Any, receive: Any, send: Any) -> None:
         async def say(message: Any) -> None:
             if message["type"] == "http.response.start":
                 headers = [*message.get("headers", []), (b"content-security-policy", POLICY.encode())]
@@ -38,12 +35,14 @@ class _OwnOnly:
             await send(message)
 
         if scope["type"] != "http":
-            await self.app(scope, receive, send)
+            await app(scope, receive, send)
         elif _is_foreign(dict(scope["headers"])):
             await say({"type": "http.response.start", "status": 403, "headers": []})
             await say({"type": "http.response.body", "body": b"Requests of other sites are refused."})
         else:
-            await self.app(scope, receive, say)
+            await app(scope, receive, say)
+
+    return served
 
 
 def _is_foreign(headers: dict[bytes, bytes]) -> bool:
@@ -79,7 +78,7 @@ def launch_page(priors: tuple[str, ...] = ("bundled",), device: str = "auto", **
         state_session_capacity=SESSIONS_KEPT,
         max_file_size=LARGEST_FILE,
         footer_links=[],
-        app_kwargs={"middleware": [Middleware(_OwnOnly)]},
+        app_kwargs={"middleware": [Middleware(_own_only)]},
         **options,
     )
 

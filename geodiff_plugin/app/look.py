@@ -92,13 +92,9 @@ def banner(status: str, more: str = "") -> str:
 
 
 def finished(status: str, figures: Sequence[tuple[str, str]], sentences: Sequence[str], cameras: str) -> str:
-    """The banner with numbers and their names, sentences, and the cameras as understood.
-
-    Where the result is not trusted the sentences come first, and the numbers stand back behind them.
-    """
-    cells = "".join(
-        f"<div><b>{html.escape(value)}</b><span>{html.escape(name)}</span></div>" for value, name in figures
-    )
+    """The banner with numbers, sentences and the cameras; of what is not trusted the sentences first."""
+    escaped = [(html.escape(value), html.escape(name)) for value, name in figures]
+    cells = "".join(f"<div><b>{value}</b><span>{name}</span></div>" for value, name in escaped)
     items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in sentences)
     numbers, notes = f'<div class="figures">{cells}</div>', f"<ul>{items}</ul>" if items else ""
     body = numbers + notes if status == "trusted" else notes + numbers

@@ -68,29 +68,6 @@ THEME = gr.themes.Base(
 QUICK: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
 
 
-class _Desk:
-    """Who is being served: one job runs at a time, and each visitor stops only his own."""
-
-    def __init__(self) -> None:
-        self._turn = threading.Lock()
-        self._stops: dict[str | None, threading.Event] = {}  # by session; a call over the API may have none
-
-    def come(self, visitor: str | None) -> None:
-        self._stops[visitor] = threading.Event()
-
-    def stop(self, visitor: str | None) -> None:
-        if visitor in self._stops:
-            self._stops[visitor].set()
-
-    def serve(self, visitor: str | None, job: Callable[[threading.Event], Job]) -> Job:
-        stop = self._stops.setdefault(visitor, threading.Event())
-        try:
-            with self._turn:
-                return job(stop)
-        finally:
-            self._stops.pop(visitor, None)
-
-
 def _forget(job: Job | None) -> None:
     if job is not None:
         rmtree(job.folder.path, ignore_errors=True)
@@ -141,14 +118,14 @@ def _cameras(job: Job) -> str:
     return f"Left camera: {lens}; the right one {away:.3g} m away, {way}."
 
 
-def _everything(panels: SimpleNamespace, job: Job) -> dict[Any, Any]:
-    """Every panel's value for a new result, but the cloud's, which is drawn when its tab is opened."""
+def _everything(panels: SimpleNamespace, job: Job, opened: str) -> dict[Any, Any]:
+    """Every panel's value for a new result; the cloud's only while its tab is open."""
     verdict = job.output.verdict
     sentences = dict.fromkeys([*verdict.reasons, *job.warnings])
     told = [for_visitors(sentence) for sentence in sentences if sentence != verdict.sentence]
     marked, words = measurement(job, [])
     sure = picture(job, "confidence")
-    return {
+    shown = {
         panels.status: look.finished(verdict.status, _figures(job), told, _cameras(job)),
         panels.measure_verdict: look.banner(verdict.status),
         panels.files_verdict: look.banner(verdict.status),
@@ -160,6 +137,9 @@ def _everything(panels: SimpleNamespace, job: Job) -> dict[Any, Any]:
         panels.confidence: sure,
         panels.confidence_legend: "" if sure is None else legend_of_confidence(),
     }
+    if opened == CLOUD_TAB:
+        shown[panels.scene], shown[panels.points] = _scene(job)
+    return shown
 
 
 def _scene(job: Job) -> tuple[Any, str]:
@@ -175,16 +155,18 @@ def _wire_run(
     form: Form, panels: SimpleNamespace, state: gr.State, points: gr.State, tab: gr.State, priors: Priors
 ) -> Callable[[gr.Request], Any]:
     """Everything from the run to its result; what happens when a visitor leaves."""
-    desk, fields = _Desk(), list(form.fields.values())
+    fields, turn = list(form.fields.values()), threading.Lock()  # one job runs at a time
+    stops = dict[str | None, threading.Event]()  # by session; a call over the API may have none
     fixed = (panels.tabs, panels.pixel, panels.add, panels.clear)
     shows = [component for component in vars(panels).values() if component not in fixed]
 
     def come(request: gr.Request) -> str:
-        desk.come(request.session_hash)
+        stops[request.session_hash] = threading.Event()
         return look.BUSY
 
     def stop(request: gr.Request) -> str:
-        desk.stop(request.session_hash)
+        if request.session_hash in stops:
+            stops[request.session_hash].set()
         return look.STOPPED
 
     def nothing(status: str) -> dict[Any, Any]:
@@ -198,19 +180,19 @@ def _wire_run(
         *values: Any,
     ) -> dict[Any, Any]:
         """Depth in metres of the left photograph, with its files."""
-        *filled, before, opened = values
+        (*filled, before, opened), visitor = values, request.session_hash
         _forget(before)
         try:
-            wanted = form.options(tuple(filled))
-            job = desk.serve(request.session_hash, lambda stop: run_job(wanted, priors, stop, progress))
-            values_now = {state: job, points: [], **_everything(panels, job)}
+            wanted, ended = form.options(tuple(filled)), stops.setdefault(visitor, threading.Event())
+            with turn:
+                job = run_job(wanted, priors, ended, progress)
+            return {state: job, points: [], **_everything(panels, job, opened)}
         except Stopped:
             return nothing(look.STOPPED)
         except Exception as error:  # whatever it is, the visitor reads a sentence
             return nothing(look.failed(_sentence(error)))
-        if opened == CLOUD_TAB:
-            values_now[panels.scene], values_now[panels.points] = _scene(job)
-        return values_now
+        finally:
+            stops.pop(visitor, None)
 
     def take(event: gr.SelectData) -> list[Any]:
         return form.example(int(event.index))

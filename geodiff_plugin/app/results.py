@@ -40,16 +40,12 @@ Pixels = list[tuple[int, int]]
 
 @dataclass(frozen=True)
 class Reading:
-    """What the depth map says at one pixel ``(x, y)``.
-
-    ``point_m (3,)`` is metres in the left camera's frame; ``spread`` the standard deviation of the depth as a
-    share of it, ``None`` where nothing tells; ``confidence`` in [0, 1], or ``None``.
-    """
+    """What the depth map says at one pixel ``(x, y)``."""
 
     pixel: tuple[int, int]
-    point_m: np.ndarray
-    spread: float | None
-    confidence: float | None
+    point_m: np.ndarray  # (3,) in the left camera's frame
+    spread: float | None  # standard deviation of the depth as a share of it, if anything tells
+    confidence: float | None  # in [0, 1]
 
     @property
     def depth_m(self) -> float:
@@ -159,16 +155,14 @@ def picture(job: Job, name: str) -> np.ndarray | None:
 def reading(job: Job, pixel: tuple[int, int]) -> Reading:
     """What the map says at a pixel of a picture on the page."""
     depth_m = depth_of(job)
-    height, width = depth_m.shape
-    x, y = (round((value + 0.5) / scale_of(job) - 0.5) for value in pixel)
-    inside = (min(max(x, 0), width - 1), min(max(y, 0), height - 1))
-    return read_pixel(depth_m, K_of(job), inside, map_of(job, "confidence"), map_of(job, "uncertainty"))
+    most = np.array(depth_m.shape[::-1]) - 1
+    x, y = np.rint((np.array(pixel) + 0.5) / scale_of(job) - 0.5).astype(int).clip(0, most)
+    return read_pixel(depth_m, K_of(job), (x, y), map_of(job, "confidence"), map_of(job, "uncertainty"))
 
 
 def _legend(colours: np.ndarray, marks: Sequence[tuple[float, str]], caption: str) -> str:
-    stops = ", ".join(
-        f"rgb({r},{g},{b}) {100 * i / (len(colours) - 1):.1f}%" for i, (r, g, b) in enumerate(colours)
-    )
+    places = zip(np.linspace(0, 100, len(colours)), colours, strict=True)
+    stops = ", ".join(f"rgb({r},{g},{b}) {place:.1f}%" for place, (r, g, b) in places)
     words = "".join(f'<span style="left:{100 * share:.2f}%">{text}</span>' for share, text in marks)
     bar = f"background:linear-gradient(90deg, {stops})"
     return (

@@ -14,7 +14,6 @@ from transformers.utils import logging as transformers_logging
 __all__ = ["PRIOR_FOLDER", "load_bundled_prior", "no_bars", "open_pipeline"]
 
 PRIOR_FOLDER = Path(__file__).parent / "prior"
-"""The pipeline folder in the package."""
 
 
 def load_bundled_prior(
@@ -22,12 +21,7 @@ def load_bundled_prior(
 ) -> MarigoldDepthPipeline:
     """The small depth prior of this package, a new stock pipeline on every call; nothing is downloaded.
 
-    Args:
-        device: where it goes; the CPU for ``None``.
-        dtype: of its weights; they are stored in float16.
-
-    Raises:
-        OSError: the package was installed without its weights.
+    ``device`` is the CPU for ``None``; ``OSError`` where the package was installed without its weights.
     """
     return open_pipeline(PRIOR_FOLDER, device, dtype)
 

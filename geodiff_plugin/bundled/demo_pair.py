@@ -16,30 +16,17 @@ DEMO_PAIR_FOLDER = Path(__file__).resolve().parent / "pair"
 
 @dataclass(frozen=True)
 class DemoPair:
-    """Two views with the truth.
+    """Two views with the truth."""
 
-    Attributes:
-        left: ``(H, W, 3)`` float32 in [0, 1].
-        right: likewise.
-        rig: cameras of both.
-        depth_m: ``(H, W)`` float32 metres, to the millimetre.
-        valid: ``(H, W)`` bool, where the truth is known.
-    """
-
-    left: np.ndarray
+    left: np.ndarray  # (H, W, 3) float32 in [0, 1]
     right: np.ndarray
     rig: Rig
-    depth_m: np.ndarray
-    valid: np.ndarray
+    depth_m: np.ndarray  # (H, W) float32 metres, to the millimetre
+    valid: np.ndarray  # (H, W) where the truth is known
 
 
 def read_demo_pair() -> DemoPair:
     """Read the pair that ships with the package."""
-    depth_m, valid = read_depth_png(DEMO_PAIR_FOLDER / "depth_mm.png")
-    return DemoPair(
-        left=read_image(DEMO_PAIR_FOLDER / "left.png")[0],
-        right=read_image(DEMO_PAIR_FOLDER / "right.png")[0],
-        rig=read_calibration(DEMO_PAIR_FOLDER / "calib.txt"),
-        depth_m=depth_m,
-        valid=valid,
-    )
+    left, right = (read_image(DEMO_PAIR_FOLDER / f"{side}.png")[0] for side in ("left", "right"))
+    rig = read_calibration(DEMO_PAIR_FOLDER / "calib.txt")
+    return DemoPair(left, right, rig, *read_depth_png(DEMO_PAIR_FOLDER / "depth_mm.png"))

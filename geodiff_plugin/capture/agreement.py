@@ -40,10 +40,9 @@ class DepthFrame:
 
 
 def seen_in(frame: DepthFrame, other: DepthFrame) -> Maps:
-    """Where another frame's camera sees the points of a frame.
+    """Where another frame's camera sees the points of a frame, ``(H, W)`` each.
 
-    ``(H, W)`` each: rows and columns of its nearest pixels (0 where it does not see the point), depth of the
-    point in its camera, whether it is inside of the picture.
+    Rows and columns of its nearest pixels (0 outside), depth in its camera, whether inside of the picture.
     """
     T = np.linalg.inv(other.E)
     points = (frame.world() @ T[:3, :3].T + T[:3, 3]) @ other.K.T
@@ -57,11 +56,10 @@ def seen_in(frame: DepthFrame, other: DepthFrame) -> Maps:
 
 
 def agreed(frame: DepthFrame, others: Sequence[DepthFrame]) -> DepthFrame:
-    """A frame's depth, as it came from its own run, averaged with that of others where they agree.
+    """A frame, with its depth averaged with that of others where they agree, ``confirmed`` and ``asked``.
 
     A depth that no other frame confirms gives way to one on which several others agree and which together
-    count more. Depth is a mean over inverse depths weighted by confidence. Returns the frame with
-    ``confirmed`` and ``asked``.
+    count more. Depth is a mean over inverse depths weighted by confidence.
 
     Source: Merrell et al. 2007, S4: depth maps rendered into one view, supported by those that agree.
     """
@@ -98,10 +96,9 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame]) -> DepthFrame:
 
 
 def _depth_by(other: DepthFrame, frame: DepthFrame) -> Maps:
-    """What another frame says of the depth of every pixel of a frame, at the point where that puts it.
+    """What another frame says of every pixel of a frame, at the point where that puts it, ``(H, W)`` each.
 
-    ``(H, W)`` each: its depth, brought into the frame's view, its confidence, whether it sees the point, and
-    whether both mean the same point.
+    Its depth in the frame's view, its confidence, whether it sees the point, whether both mean the same one.
     """
     row, column, z, seen = seen_in(frame, other)
     there = other.depth[row, column].astype(np.float64)

@@ -65,13 +65,10 @@ class Capture:
         fov: float | None = None,
         trajectory: str | os.PathLike[str] | None = None,
     ) -> Self:
-        """Read a capture; the layout is recognised (docs/how-to/captures.md lists them).
+        """Read a capture, a file or folder whose layout is recognised (docs/how-to/captures.md lists them).
 
-        Args:
-            path: file or folder.
-            K: ``(3, 3)`` intrinsics in pixels, where the capture has none.
-            fov: horizontal field of view in degrees, likewise.
-            trajectory: of a video, in TUM's form.
+        Where it has no intrinsics they are ``K (3, 3)`` pixels, or by a horizontal field of view in degrees;
+        ``trajectory`` is of a video, in TUM's form.
 
         Raises:
             FileNotFoundError: nothing there.
@@ -86,9 +83,8 @@ class Capture:
         """The frame of a name; ``InputError`` where there is none."""
         if name not in self._number:
             some = ", ".join(self.names[:3])
-            bad_value(
-                "a frame", f"a name of the capture, such as {some}", repr(name), "Names are file stems."
-            )
+            cure = "Names are file stems."
+            bad_value("a frame", f"a name of the capture, such as {some}", repr(name), cure)
         return self.files.frames[self._number[name]]
 
     def choose(self, wanted: str | None) -> list[str]:
@@ -137,20 +133,15 @@ class Capture:
     def rescale(self, factor: float) -> None:
         """Multiply all lengths, which then are metres, by a factor above 0."""
         check_number(factor, "metres per unit", 1e-12, 1e12)
-        frames = tuple(
-            replace(
-                frame,
-                E=None if frame.E is None else _longer(frame.E, factor),
-                points=None if frame.points is None else frame.points * factor,
-            )
-            for frame in self.files.frames
-        )
-        self.files = replace(self.files, frames=frames, unit="m")
-        self.unit = "m"
-        if self.solved is not None:
-            s = self.solved
-            given = None if s.E_given is None else _longer(s.E_given, factor)
-            self.solved = replace(s, E=_longer(s.E, factor), E_given=given, points=s.points * factor)
+        frames, solved, longer = [], self.solved, np.ones((4, 4))
+        longer[:3, 3] = factor
+        for frame in self.files.frames:
+            points = None if frame.points is None else frame.points * factor
+            frames.append(replace(frame, E=None if frame.E is None else frame.E * longer, points=points))
+        self.files, self.unit = replace(self.files, frames=tuple(frames), unit="m"), "m"
+        if solved is not None:
+            given = None if solved.E_given is None else solved.E_given * longer
+            self.solved = replace(solved, E=solved.E * longer, E_given=given, points=solved.points * factor)
 
     def image(self, name: str) -> np.ndarray:
         """``(H, W, 3)`` float32 in [0, 1], upright, free of lens distortion."""
@@ -267,20 +258,13 @@ class Capture:
         return pipe(self.image(name), guidance=guidance, generator=generator, **call)
 
 
-def _longer(E: np.ndarray, factor: float) -> np.ndarray:
-    E = E.copy()
-    E[..., :3, 3] *= factor
-    return E
-
-
 def choose_neighbours(
     solved: SolvedCapture, frame: int, most: int, among: Collection[int] | None = None
 ) -> list[int]:
     """Numbers of at most ``most`` neighbours of a frame, the best first, ``among`` those given if any are.
 
-    Every shared point counts by the angle of its two rays, as in COLMAP's and MVSNet's view selection, and
-    less where earlier neighbours see it: so the neighbours together see all of the frame. Those nearest by
-    position where the frame shares no points.
+    Every shared point counts by the angle of its two rays, and less where earlier neighbours see it: so they
+    together see all of the frame. Those nearest by position where the frame shares no points.
 
     Source: Yao et al. 2018 (MVSNet), S5.1: the piecewise Gaussian of the angle.
     """

@@ -45,11 +45,7 @@ def _frame(capture: Capture, out: Path, maps: Sequence[str], name: str) -> Depth
 
 
 def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Check finished frames against those that see the same, and write what they agree on into their folders.
-
-    By frame: how many others it was checked against, the share of its pixels that another frame sees and
-    confirms, and that another one sees and none confirms.
-    """
+    """Write what finished frames agree on with those that see the same; shares of their pixels by frame."""
     solved, number = capture.solve(), {name: i for i, name in enumerate(capture.names)}
     there, shares = {number[name] for name in names}, {}
     load = lru_cache(maxsize=2 * OTHERS)(partial(_frame, capture, out, ALONE))
@@ -72,10 +68,7 @@ def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[s
 
 
 def write_results(capture: Capture, out: Path, names: Sequence[str], export: Sequence[str]) -> dict[str, Any]:
-    """Write ``cloud.ply``, ``cloud.glb``, ``sheet.jpg`` and what ``export`` asks for.
-
-    Frames are finished, and ``write_agreement`` has been there. Returns counts for the report.
-    """
+    """Write, after ``write_agreement``, clouds, sheet and what ``export`` asks for; counts for the report."""
     load = partial(_frame, capture, out, AGREED)
     cloud, normals = fuse(names, load, capture.image)
     parts, count = (cloud.points_m, normals, cloud.colours), len(cloud.points_m)
@@ -135,23 +128,18 @@ def fuse(
     ``load`` gives the agreed frame of a name, ``image`` its ``(H, W, 3)`` in [0, 1].
     """
     cell = CELL_SHARE * float(np.median([np.median(load(name).depth) for name in names]))
-    every_point = np.zeros((0, 9))
-    parts: list[np.ndarray] = []
+    every_point, parts = np.zeros((0, 9)), list[np.ndarray]()
     for number, name in enumerate(names, 1):
-        parts.append(_points(load(name), image(name), cell))
+        frame = load(name)
+        mask = kept(frame)
+        normals = normals_of(frame.depth, frame.K)[mask] @ frame.E[:3, :3].T
+        rows = np.hstack([frame.world(mask), normals, image(name)[mask] * 255])
+        parts.append(_thinned(rows[:: max(1, len(rows) // MOST_POINTS)], cell))
         if number % MERGED_AFTER == 0 or number == len(names):
             every_point, parts = _thinned(np.concatenate([every_point, *parts]), cell), []
     normals = every_point[:, 3:6]
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return Cloud(every_point[:, :3], np.rint(every_point[:, 6:]).astype(np.uint8)), normals
-
-
-def _points(frame: DepthFrame, image: np.ndarray, cell: float) -> np.ndarray:
-    """``(N, 9)`` places, normals and colours of one frame, in the world's frame."""
-    mask = kept(frame)
-    every = max(1, int(mask.sum()) // MOST_POINTS)
-    normals = normals_of(frame.depth, frame.K)[mask] @ frame.E[:3, :3].T
-    return _thinned(np.hstack([frame.world(mask), normals, image[mask] * 255])[::every], cell)
 
 
 def _thinned(rows: np.ndarray, cell: float) -> np.ndarray:
@@ -175,11 +163,7 @@ def write_workspace(
 ) -> None:
     """Write a dense workspace of COLMAP: images, sparse model, depth (where it is kept) and normal maps.
 
-    ``points (M, 3)`` are those of the poses' solve, ``seen`` where each of the frames sees them: by
-    what frames share COLMAP chooses pairs.
-
-    Convention:
-        ``colmap stereo_fusion --workspace_path FOLDER --input_type geometric --output_path fused.ply``
+    ``points (M, 3)`` are those of the solve, ``seen`` by frame: by what they share COLMAP chooses pairs.
     """
     for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps", "stereo/consistency_graphs"):
         (folder / name).mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,4 @@
-"""The ``geodiff`` command: its subcommands, with the options of those that have few.
-
-Torch and diffusers are imported inside the commands, so that ``--help`` and ``--version`` answer at once.
-"""
+"""The ``geodiff`` command: its subcommands, which import torch when they run, and options of most of them."""
 
 from __future__ import annotations
 
@@ -27,11 +24,9 @@ _out = partial(declare, panel=OUTPUT)
 
 
 def _imported(where: str) -> Callable[..., Any]:
-    """A function of the package, imported when it is needed.
-
-    OpenMP's threads spin while they wait, which on a busy machine takes the core from the thread that they
-    wait for; asleep they cost one call in ten on an idle machine and save half of it on a busy one.
-    """
+    """A function of the package, imported when it is needed."""
+    # OpenMP's threads spin while they wait, which on a busy machine takes the core from the thread that they
+    # wait for; asleep they cost one call in ten on an idle machine and save half of it on a busy one.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     module, _, name = where.rpartition(".")
     function: Callable[..., Any] = getattr(importlib.import_module(f"geodiff_plugin.{module}"), name)
@@ -54,24 +49,27 @@ def _depth(options: DepthOptions) -> None:
     from geodiff_plugin.cli.pairs import is_many, start_many
     from geodiff_plugin.formats.recordings import is_bag
 
-    bag, failed = is_bag(options.left), False
-    if not bag:
+    if not is_bag(options.left):
         names = ("topic_left", "topic_right")
         options.refuse(names, "left out where LEFT is no bag", "given", "Images are LEFT and RIGHT.")
-    if bag:
+    if is_bag(options.left):
         failed = _imported("cli.many.run_bag")(options)
     elif is_many(options.left):
         options = replace(options, out=options.out or Path("geodiff-out"))
         refs = start_many(options)
         failed = _imported("cli.many.run_many")(options, refs)
     else:
-        options, watch = _with_folder(options, "geodiff-out"), StopWatch()
+        options, watch, failed = _with_folder(options, "geodiff-out"), StopWatch(), False
         with start_pair(options) as folder:
             with watch.stage("start"):
                 run = _imported("cli.depth.run_depth")
             run(options, folder, watch)
     if failed:
         sys.exit(EXIT_SOME_FAILED)
+
+
+def _capture(options: CaptureOptions) -> None:
+    _imported("cli.capture.run_capture")(options)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,9 +90,7 @@ class _Demo:
 @dataclass(frozen=True, kw_only=True)
 class _Info:
     prior: str | None = declare(None, "Describe this prior as well.")
-    space: str | None = declare(
-        None, "Space in which its map is affine, if its folder does not say.", choices=SPACES
-    )
+    space: str | None = declare(None, "Space of its map, if its folder does not say.", choices=SPACES)
     knobs: bool = declare(False, "List the knobs of the guidance instead: default, range, what each does.")
 
 
@@ -105,9 +101,7 @@ class _Bench:
 
 @dataclass(frozen=True, kw_only=True)
 class _Video:
-    frames: tuple[Path, ...] = declare(
-        MISSING, "Folders of geodiff depth, or .npy maps, in order.", "", metavar="FRAME..."
-    )
+    frames: tuple[Path, ...] = declare(MISSING, "Results of geodiff depth, or maps.", "", metavar="FRAME...")
     out: Path = _out(Path("depth.webp"), "The video: .mp4 (OpenCV), .webp or .gif.", "--out", "-o")
     fps: float = declare(10.0, "Frames a second.")
     near: float | None = declare(None, "Depth of the last colour, metres.")
@@ -140,29 +134,19 @@ class _Convert:
         "",
         metavar="SRC DST | marigold-v2 BASE CHECKPOINT DST",
     )
-    part: str | None = declare(
-        None, "What is not in SRC (docs/reference/priors.md): a file, a folder or a hub id.", "--with"
-    )
-    space: str | None = declare(
-        None, "marigold-v2: space of its map, if CHECKPOINT's folder does not say.", choices=SPACES
-    )
+    part: str | None = declare(None, "File, folder or hub id of what SRC lacks (priors.md).", "--with")
+    space: str | None = declare(None, "marigold-v2: as for geodiff info.", choices=SPACES)
 
 
 COMMANDS = {
     "depth": Command(DepthOptions, _depth, "Metric depth of LEFT guided by RIGHT; of one pair, or of many."),
-    "capture": Command(
-        CaptureOptions,
-        lambda options: _imported("cli.capture.run_capture")(options),
-        "Depth of a capture's frames, and one cloud of all.",
-    ),
+    "capture": Command(CaptureOptions, _capture, "Depth of a capture's frames, and one cloud of all."),
     "demo": Command(_Demo, _Demo.run, "Run on a rendered pair of the package, and print how good it is."),
     "info": Command(_Info, _later("cli.info.run_info"), "Versions, devices, priors and what is cached."),
     "bench": Command(_Bench, _later("cli.demo.run_bench"), "What guidance costs in seconds and memory."),
-    "video": Command(_Video, _later("cli.results.run_video"), "Join depth maps of a sequence into a video."),
-    "submit": Command(_Submit, _later("cli.results.run_submit"), "Write what Middlebury and ETH3D take."),
-    "app": Command(
-        _Page, _later("app.launch.run_app"), "Serve a web page on which to measure (needs the extra app)."
-    ),
+    "video": Command(_Video, _later("cli.outputs.run_video"), "Join depth maps of a sequence into a video."),
+    "submit": Command(_Submit, _later("cli.outputs.run_submit"), "Write what Middlebury and ETH3D take."),
+    "app": Command(_Page, _later("app.launch.run_app"), "Serve a web page to measure on (extra app)."),
     "convert": Command(_Convert, _later("cli.convert.run_convert"), "Make a folder for --prior of weights."),
     "eval": Command(None, lambda _: _imported("cli.eval.eval_app"), "Measure it and others on data sets."),
 }

@@ -35,7 +35,7 @@ from geodiff_plugin.runner import BROKEN, Item, Journal, Runner, fingerprint, th
 from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.types import MetricDepthOutput
 
-POSES_FILE, SCALE_FILE, JOURNAL = "poses.npz", "scale.json", "frames.jsonl"
+POSES_FILE, JOURNAL = "poses.npz", "frames.jsonl"
 #: What the poses depend on, and beside them the depth of a frame.
 OF_POSES = ("poses", "k", "fov", "trajectory")
 OF_SCALE = ("metres_per_unit", "known_length", "distance")
@@ -61,17 +61,21 @@ def open_capture(options: CaptureOptions) -> Capture:
     return capture
 
 
-def solved_poses(capture: Capture, options: CaptureOptions) -> None:
-    """Solve for the poses, or take those that an earlier run of the same capture left; then set the scale."""
+def solved_poses(capture: Capture, options: CaptureOptions, factor: float | None = None) -> float | None:
+    """Solve for the poses, or take those that an earlier run of the same capture left; then set the scale.
+
+    That is the ``factor`` that another process found and returned, metres per unit of the poses.
+    """
     path, key = options.out / POSES_FILE, _key(capture, options, *OF_POSES)
     solved = None if options.overwrite else load_solved(path, key)
     if solved is None:
         solved = capture.solve(options.poses, threads=available_cores())
         _save_solved(path, solved, key)
     capture.solved = solved
-    factor = _factor(capture, options, key)
+    factor = _factor(capture, options) if factor is None else factor
     if factor is not None:
         capture.rescale(factor)
+    return factor
 
 
 def _save_solved(path: Path, solved: SolvedCapture, key: str) -> None:
@@ -127,8 +131,8 @@ def _length(capture: Capture, options: CaptureOptions) -> tuple[list[str], np.nd
     return [capture.frame(name).name for name in names], ends, length
 
 
-def _factor(capture: Capture, options: CaptureOptions, key: str) -> float | None:
-    """Metres per unit of the poses; that of ``--known-length`` by the depth of its frame, found once."""
+def _factor(capture: Capture, options: CaptureOptions) -> float | None:
+    """Metres per unit of the poses; that of ``--known-length`` by the depth of its frame."""
     given = _length(capture, options)
     if given is None:
         return options.metres_per_unit
@@ -139,19 +143,10 @@ def _factor(capture: Capture, options: CaptureOptions, key: str) -> float | None
         if not apart > 0:
             bad_value("--distance", "of two frames with different positions", repr(options.distance))
         return metres / apart
-    path, asked = options.out / SCALE_FILE, f"{key} {options.known_length}"
-    try:
-        saved = json.loads(path.read_text(encoding="utf-8"))
-        if saved["of"] == asked and not options.overwrite:
-            return float(saved["metres_per_unit"])
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
     depth = single_map(_depth(capture, _pipe(options), names[0], options).prediction)
     rays = np.linalg.solve(solved.K[numbers[0]], np.c_[ends, np.ones(2)].T).T
     points = rays * depth[tuple(np.rint(ends).astype(int).T[::-1])][:, None]
-    factor = metres / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
-    write_text(path, json.dumps({"metres_per_unit": factor, "of": asked}) + "\n")
-    return factor
+    return metres / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
 
 
 def _pipe(options: CaptureOptions) -> Any:
@@ -210,15 +205,14 @@ def _rounded(value: float) -> float | None:
     return round(value, 4) if math.isfinite(value) else None
 
 
-def _run_frames(capture: Capture, options: CaptureOptions, names: Sequence[str]) -> list[Record]:
-    """Depth of every chosen frame that is not done yet, by one process a core.
-
-    Returns the reports in the order of the names; ``{"key", "status": "broken", "error"}`` of a frame that
-    failed. ``InputError`` if every frame failed for one reason.
-    """
+def _run_frames(
+    capture: Capture, options: CaptureOptions, names: Sequence[str], factor: float | None
+) -> list[Record]:
+    """Depth of every chosen frame that is not done yet, by one process a core; their reports in order."""
     if options.overwrite:
         (options.out / JOURNAL).unlink(missing_ok=True)
-    items = _items(capture, options, names)
+    key = _key(capture, options, *OF_POSES, *OF_FRAME)
+    items, more = [Item(name, inputs=key) for name in names], list[Any]()
     journal = Journal(options.out / JOURNAL)
     left = sum(journal.get(item) is None for item in items)
     journal.close()
@@ -226,23 +220,16 @@ def _run_frames(capture: Capture, options: CaptureOptions, names: Sequence[str])
     held = int(psutil.virtual_memory().available / PROCESS_BYTES)  # by the memory
     wanted = options.processes or (min(available_cores(), max(1, held)) if on_cpu else 1)
     count = max(1, min(wanted, left)) if this_process().count == 1 else 1
-    context = multiprocessing.get_context("spawn")
-    more = [
-        context.Process(target=_help, args=(options, names, i, count), daemon=True) for i in range(1, count)
-    ]
-    for process in more:
-        process.start()
+    for index in range(1, count):
+        arguments = (options, items, factor, index, count)
+        more.append(multiprocessing.get_context("spawn").Process(target=_help, args=arguments, daemon=True))
+        more[-1].start()
     try:
         return _work(capture, options, items, count)
     finally:
         for process in more:
             process.terminate()
             process.join()
-
-
-def _items(capture: Capture, options: CaptureOptions, names: Sequence[str]) -> list[Item]:
-    key = _key(capture, options, *OF_POSES, *OF_FRAME)
-    return [Item(name, inputs=key) for name in names]
 
 
 def _work(capture: Capture, options: CaptureOptions, items: Sequence[Item], count: int) -> list[Record]:
@@ -259,13 +246,13 @@ def _work(capture: Capture, options: CaptureOptions, items: Sequence[Item], coun
         return runner.run(partial(_write_frame, capture, options, cache(partial(_pipe, options))))
 
 
-def _help(options: CaptureOptions, names: Sequence[str], index: int, count: int) -> None:
+def _help(options: CaptureOptions, items: list[Item], factor: float | None, index: int, count: int) -> None:
     """Another process of the same run, which takes frames that nobody has taken."""
     os.environ.update(RANK=str(index), WORLD_SIZE=str(count), LOCAL_RANK="0")
     options = replace(options, overwrite=False, quiet=True)
     capture = open_capture(options)
-    solved_poses(capture, options)
-    _work(capture, options, _items(capture, options, names), count)
+    solved_poses(capture, options, factor)
+    _work(capture, options, items, count)
 
 
 def capture_report(options: CaptureOptions) -> Record:
@@ -276,14 +263,14 @@ def capture_report(options: CaptureOptions) -> Record:
     for note in capture.files.notes:
         say(note)
     options.out.mkdir(parents=True, exist_ok=True)
-    solved_poses(capture, options)
+    factor = solved_poses(capture, options)
     seconds = {"poses": round(time.perf_counter() - started, 1)}
     solved = capture.solve()
     if not options.quiet:
         say(f"poses {solved.status}: matches lie {solved.residual_px:.2f} px off their epipolar lines")
     for note in solved.notes:
         say(f"warning: {note}")
-    frames = _run_frames(capture, options, names)
+    frames = _run_frames(capture, options, names, factor)
     seconds["frames"] = round(time.perf_counter() - started - seconds["poses"], 1)
     done = [report["frame"] for report in frames if report.get("status") != BROKEN]
     agreement = write_agreement(capture, options.out, done)

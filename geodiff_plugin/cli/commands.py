@@ -24,10 +24,7 @@ APPEARANCE: dict[str, Any] = {
 
 
 class Command(NamedTuple):
-    """A command: its dataclass of options, what is called with an instance, and what it does, a sentence.
-
-    A group of commands has no options, and its function returns the group.
-    """
+    """A command: its options, what is called with them (of a group without: returns it), and what it does."""
 
     options: type | None
     run: Callable[[Any], Any]

@@ -23,7 +23,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from transformers import Dinov2Config, Dinov2Model
 
-from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors.components import FixedPrompt
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.loading import Layout, check_weights, load_component, reading
@@ -75,10 +75,7 @@ NAMES = ((r"\.base_layer\.", "."), (r"\.lora_([AB])(\.default)?\.weight$", r".we
 
 
 def run_convert(paths: Sequence[Path], part: str | None = None, space: str | None = None) -> None:
-    """Convert and say where it is; nothing is left behind where that fails.
-
-    ``part`` is the file, folder or hub id of what the checkpoint lacks; ``None`` for the usual one.
-    """
+    """Convert and say where it is; ``part`` is the file, folder or hub id of what the checkpoint lacks."""
     layered = len(paths) == 4 and str(paths[0]) == MARIGOLD_V2
     if not layered and len(paths) != 2:
         expected = f"SRC DST, or {MARIGOLD_V2} BASE CHECKPOINT DST"
@@ -103,8 +100,6 @@ def run_convert(paths: Sequence[Path], part: str | None = None, space: str | Non
             kind = _convert_file(source, unfinished, part)
         unfinished.chmod(0o755)  # mkdtemp's is its owner's alone
         os.replace(unfinished, target)
-    except InputError:
-        raise
     except (KeyError, RuntimeError, AttributeError, TypeError) as error:  # of networks that it does not fit
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         bad_value("SRC", "a whole checkpoint of its kind", f"{source} ({reason})", "Fetch it anew.")
@@ -189,10 +184,7 @@ def _convert_folder(source: Path, folder: Path) -> None:
 
 
 def unet_config(hparams: Mapping[str, Any]) -> dict[str, Any]:
-    """Config of ``UNet2DConditionModel`` for the options of a CompVis ``UNetModel``.
-
-    Options that change the weights' names or shapes in another way are noticed when these are loaded.
-    """
+    """Config of ``UNet2DConditionModel`` for the options of a CompVis ``UNetModel``."""
     width, mults = hparams["model_channels"], hparams["channel_mult"]
     attends = [2**level in set(hparams["attention_resolutions"]) for level in range(len(mults))]
     kinds = ["CrossAttn" if attending else "" for attending in attends]
@@ -312,13 +304,11 @@ def _convert_file(source: Path, folder: Path, part: str | None) -> str:
 
 
 def merged(name: str, weight: Tensor, trained: Mapping[str, Tensor]) -> Tensor:
-    """A weight of the base with what was trained: in its place, or added to it in float32.
-
-    Alpha is the rank in every published configuration, so the product of the factors counts once.
-    """
+    """A weight of the base with what was trained: in its place, or added to it in float32."""
     weight = trained.get(name, weight).to(weight.dtype)
     if f"{name} A" not in trained:
         return weight
+    # Alpha is the rank in every published configuration, so the product of the factors counts once.
     return (weight.float() + trained[f"{name} B"].float() @ trained[f"{name} A"].float()).to(weight.dtype)
 
 
@@ -332,13 +322,6 @@ def _trained(state: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
     return result
 
 
-def _check_trained(trained: Mapping[str, Tensor], base: set[str], where: str) -> None:
-    """Refuse a checkpoint of another base, by names, before anything is written."""
-    factored = {name[:-2] for name in trained if " " in name}
-    lacking = [f"{name} of factor {f}" for name in factored for f in "AB" if f"{name} {f}" not in trained]
-    check_weights(lacking, {name.partition(" ")[0] for name in trained} - base, where)
-
-
 def _base_files(base: Path, name: str) -> tuple[list[Path], set[str]]:
     """The safetensors of a component of the base, and the names of their tensors."""
     folder = base / name
@@ -347,12 +330,10 @@ def _base_files(base: Path, name: str) -> tuple[list[Path], set[str]]:
     names = {path.name for path in folder.glob("*.safetensors")}
     if (folder / INDEX).is_file():
         names = set(json.loads((folder / INDEX).read_text("utf-8"))["weight_map"].values())
-    files = [folder / file for file in sorted(names)]
-    missing = [file.name for file in files if not file.is_file()]
-    if missing or not files:
-        got = f"one without {', '.join(missing)}" if missing else "one without"
+    files, tensors = [folder / file for file in sorted(names)], set[str]()
+    if not files or not all(file.is_file() for file in files):
+        got = f"one without all of {', '.join(sorted(names)) or 'them'}"
         bad_value("BASE", f"a folder with safetensors in {folder}", got, "Fetch it anew.")
-    tensors = set[str]()
     for file in files:
         with safe_open(file, "pt") as opened:
             tensors |= set(opened.keys())
@@ -389,11 +370,7 @@ def _prompt_folder(file: Path, requested: str | None) -> Path:
 def _convert_marigold_v2(
     base: Path, checkpoint: Path, folder: Path, prompts: str | None, space: str | None
 ) -> None:
-    """Write the folder of a prior; at most one file of the base is in memory.
-
-    Of the base, Qwen-Image-Edit-2509 in diffusers' layout, ``transformer/`` and ``vae/`` are read; the
-    checkpoint is a folder with ``trainables.safetensors``, or that file.
-    """
+    """Write the folder of a prior of ``transformer/`` and ``vae/`` of the base, file by file in memory."""
     file = checkpoint / TRAINABLES if os.path.isdir(checkpoint) else checkpoint
     if not os.path.isfile(file) or file.suffix != ".safetensors":
         expected = f"a folder of huawei-bayerlab/marigold-v2-0 with {TRAINABLES}, such as depth/Log-stage2"
@@ -404,7 +381,10 @@ def _convert_marigold_v2(
     files = {}
     for part, name in FOLDERS.items():
         files[name], tensors = _base_files(base, name)
-        _check_trained(trained[part], tensors, str(file))
+        known = trained[part]
+        factors = {f"{key[:-2]} {factor}" for key in known if " " in key for factor in "AB"}
+        missing = [f"{key[:-2]} of factor {key[-1]}" for key in factors - known.keys()]
+        check_weights(missing, {key.partition(" ")[0] for key in known} - tensors, str(file))
     if not any(name.endswith(" A") for name in trained["Diffuser"]):
         bad_value(str(file), "a checkpoint of Marigold V2 with a LoRA (Diffuser.*.lora_A.*)", "one without")
     for part, name in FOLDERS.items():
@@ -415,9 +395,8 @@ def _convert_marigold_v2(
         for source in files[name]:
             whole = {key: merged(key, v, trained[part]) for key, v in load_file(source).items()}
             _save_weights(whole, folder / name / source.name)
-    component = _fixed_prompt(prompt)
-    component.to(prompt.dtype if prompt.is_floating_point() else torch.float32)
-    component.save_pretrained(folder / "prompt")
+    dtype = prompt.dtype if prompt.is_floating_point() else torch.float32
+    _fixed_prompt(prompt).to(dtype).save_pretrained(folder / "prompt")
     FlowMatchEulerDiscreteScheduler().save_pretrained(folder / "scheduler")
     index = INDEX_OF_PRIOR | {"prediction_type": space}
     (folder / "model_index.json").write_text(json.dumps(index, indent=2), encoding="utf-8")

@@ -9,13 +9,11 @@ import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
-from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, DemoPair, read_demo_pair
+from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
 from geodiff_plugin.cli.depth import estimate_and_write, load_guided_prior
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.outputs import single_map, summary_line
@@ -32,15 +30,6 @@ CELL_WIDTH = 360
 VARIANTS = {"plain": None, "guided, denoised gradient": "denoised", "guided, full gradient": "full"}
 
 
-def _write_comparison(path: Path, pair: DemoPair, aligned_m: np.ndarray, guided_m: np.ndarray) -> None:
-    """Left image, prior, guided, truth side by side, the three maps in the truth's colours."""
-    near, far = depth_range(pair.depth_m)
-    maps = [colour_depth(depth_m, near=near, far=far) for depth_m in (aligned_m, guided_m, pair.depth_m)]
-    titles = ["left image", "prior, aligned by an oracle", "guided", f"truth, {near:.1f} m to {far:.1f} m"]
-    with atomic_path(path) as temporary:
-        grid([pair.left, *maps], titles, cell_width=CELL_WIDTH).save(temporary, optimize=True)
-
-
 def run_demo(options: DepthOptions, out: OutFolder) -> None:
     """Write what ``geodiff depth`` writes and ``comparison.png``, and print how far it is from the truth."""
     pipe, job, report = estimate_and_write(options, out, StopWatch())
@@ -54,8 +43,12 @@ def run_demo(options: DepthOptions, out: OutFolder) -> None:
         scores = evaluate_depth(depth_m, pair.depth_m, pair.valid)
         table.add_row(name, *(f"{scores[metric]:.3f}" for metric in ("abs_rel", "delta1", "rmse")))
     show(table)
+    near, far = depth_range(pair.depth_m)
+    maps = [colour_depth(depth_m, near=near, far=far) for depth_m in (aligned_m, guided_m, pair.depth_m)]
+    titles = ["left image", "prior, aligned by an oracle", "guided", f"truth, {near:.1f} m to {far:.1f} m"]
     try:
-        _write_comparison(out.path / "comparison.png", pair, aligned_m, guided_m)
+        with atomic_path(out.path / "comparison.png") as temporary:
+            grid([pair.left, *maps], titles, cell_width=CELL_WIDTH).save(temporary, optimize=True)
     except OSError as error:  # the result itself is safe
         say(f"geodiff: comparison.png could not be written ({error.strerror or error}).")
     print(summary_line(report, f"{out.path}/"))
@@ -84,19 +77,6 @@ def measure(gradient: str | None, device_name: str, repeats: int = 2, **knobs: A
     return min([timed(call, device) for _ in range(repeats)], default=first), memory.peak_bytes
 
 
-def _command_seconds(device: str) -> dict[str, float]:
-    """Seconds of ``geodiff depth`` on the demo pair by stage; "python" is what lies around them."""
-    with tempfile.TemporaryDirectory() as folder:
-        images = [str(DEMO_PAIR_FOLDER / name) for name in ("left.png", "right.png")]
-        options = ["--calib", str(DEMO_PAIR_FOLDER / "calib.txt"), "--device", device, "--json", "--quiet"]
-        words = [sys.executable, "-m", "geodiff_plugin", "depth", *images, *options, "--out", f"{folder}/out"]
-        started = time.perf_counter()
-        answer = subprocess.run(words, check=True, capture_output=True, text=True)
-        whole = time.perf_counter() - started
-    stages: dict[str, float] = json.loads(answer.stdout)["seconds"]
-    return stages | {"python": whole - sum(stages.values())}
-
-
 def run_bench(device: str) -> None:
     """Print the table, every row measured in a process of its own, and where a command's time goes."""
     place, costs = pick_device(device), []
@@ -108,7 +88,15 @@ def run_bench(device: str) -> None:
         seconds, peak_bytes = costs[-1]
         ratios = f"{seconds / costs[0][0]:.2f}", f"{peak_bytes / max(costs[0][1], 1):.2f}"
         table.add_row(name, f"{seconds:.2f}", f"{peak_bytes / 1e6:.0f}", *ratios)
-    stages = _command_seconds(str(place))
+    left, right, calib = (str(DEMO_PAIR_FOLDER / name) for name in ("left.png", "right.png", "calib.txt"))
+    with tempfile.TemporaryDirectory() as folder:
+        options = ["--calib", calib, "--device", str(place), "--json", "--quiet", "--out", f"{folder}/out"]
+        words = [sys.executable, "-m", "geodiff_plugin", "depth", left, right, *options]
+        started = time.perf_counter()
+        answer = subprocess.run(words, check=True, capture_output=True, text=True)
+        whole = time.perf_counter() - started
+    stages: dict[str, float] = json.loads(answer.stdout)["seconds"]
+    stages["python"] = whole - sum(stages.values())  # what lies around them
     told = ", ".join(f"{name} {seconds:.1f}" for name, seconds in stages.items())
     command = f"geodiff depth: {sum(stages.values()):.1f} s ({told})"
     show(f"bundled prior, default guidance; {where}; demo pair", table, command)

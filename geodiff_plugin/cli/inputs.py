@@ -120,15 +120,8 @@ def read_rig(
         names = str(options.left), str(options.right)
     way = options.cameras_way()
     if way == "file":
-        rig = read_calibration(
-            options.calib,
-            options.camera_pair(),
-            str(options.left),
-            image_names=names,
-            image_size=left_size,
-            baseline_m=options.baseline,
-            distorted=True,
-        )
+        of: dict[str, Any] = {"image_names": names, "image_size": left_size, "baseline_m": options.baseline}
+        rig = read_calibration(options.calib, options.camera_pair(), str(options.left), distorted=True, **of)
     elif way == "parameters":
         camera = [getattr(options, name) for name in PARAMETERS[:-1]]
         baseline_m = 1.0 if options.baseline is None else options.baseline
@@ -143,9 +136,8 @@ def read_rig(
     cure = "Use the images that it is for, or scale K with them and give --fx --fy --cx --cy."
     check_calibrated_size(left_size, rig.size_left, f"the left image {options.left}", rig.source, cure)
     if right_size is not None:
-        check_calibrated_size(
-            right_size, rig.size_right, f"the right image {options.right}", rig.source, cure
-        )
+        name = f"the right image {options.right}"
+        check_calibrated_size(right_size, rig.size_right, name, rig.source, cure)
     return replace(rig, size_left=left_size, size_right=right_size)
 
 

@@ -46,15 +46,12 @@ class DepthOptions(RunOptions):
 
     left: Path = declare(
         MISSING,
-        "Left image, whose depth is estimated. Or a folder, a video, or a list: LEFT,RIGHT[,CALIB] a line.",
+        "Left image; or a folder, a video, a bag, a list: LEFT,RIGHT[,CALIB] a line.",
         "",
         metavar="LEFT",
     )
     right: Path | None = declare(
-        None,
-        "Right image, not needed with --points. Or a folder, or a video; else video LEFT has both views.",
-        "",
-        metavar="RIGHT",
+        None, "Right image, folder or video; none with --points, or if a video has both.", "", metavar="RIGHT"
     )
     calib: tuple[Path, ...] = _camera((), "Calibration file, or COLMAP folder; twice for one a view.")
     cameras: str | None = _camera(None, "Which two cameras of a file that has more, as 2,3.")
@@ -67,9 +64,7 @@ class DepthOptions(RunOptions):
     k: Path | None = _camera(None, "3x3 intrinsics, text or .npy.", "--K")
     e: Path | None = _camera(None, "4x4 pose of the right camera in the left one's frame, metres.", "--E")
     k_right: Path | None = _camera(None, "3x3 intrinsics of the right image, if they differ.", "--K-right")
-    distortion: tuple[str, ...] = _camera(
-        (), "Lens: k1,k2,p1,p2[,k3...] or fisheye:k1,...,k4; for one or both."
-    )
+    distortion: tuple[str, ...] = _camera((), "Lens: k1,k2,p1,p2[,k3...] or fisheye:k1,...,k4; one or two.")
     estimate_pose: bool = _camera(False, "Find the poses from the photographs (needs the extra pose).")
     fov: float | None = _camera(None, "Horizontal field of view, degrees, if EXIF has no focal length.")
     known_length: str | None = _camera(None, "A distance in LEFT, X1,Y1,X2,Y2,METRES; instead of --baseline.")
@@ -78,13 +73,9 @@ class DepthOptions(RunOptions):
     view_e: tuple[Path, ...] = _camera((), "4x4 pose of each --view in the left camera's frame.", "--view-E")
     view_distortion: tuple[str, ...] = _camera((), "Lens of each --view, 0,0,0,0 for none; default LEFT's.")
     cropped: bool = _camera(False, "The principal point may lie outside: the images are crops.")
-    prior_map: Path | None = declare(
-        None, "Depth map of LEFT by another model in place of --prior; of many pairs a folder of maps."
-    )
+    prior_map: Path | None = declare(None, "Another model's map of LEFT (or folder of maps) as the prior.")
     points: Path | None = declare(None, "Known depths: a map of LEFT, or points (.npy, text, .ply, .bin).")
-    points_scale: float | None = declare(
-        None, "How many units of that file are a metre: 1000 for mm.", above_0="units per metre"
-    )
+    points_scale: float | None = declare(None, "Its units per metre: 1000 for mm.", above_0="units per metre")
     points_calib: tuple[Path, ...] = declare((), "KITTI's lidar calibration for a .bin; twice for two files.")
     disparity: Path | None = declare(None, "Disparities of LEFT in a rectified rig, instead of --points.")
     points_confidence: Path | None = declare(None, "How far to rely on them, in [0, 1], of the same shape.")
@@ -93,9 +84,7 @@ class DepthOptions(RunOptions):
     tolerance: float = declare(0.005, "A bag: most seconds between the stamps of a pair.", low=0.0, high=10.0)
     encoding: str = _output("16UC1", "A bag: depth in whole mm, or metres.", choices=("16UC1", "32FC1"))
     min_confidence: float = _output(0.0, "Least confidence of a point in the cloud, 0 to 1.", low=0, high=1)
-    out: Path | None = _output(
-        None, "Folder for the results; geodiff-out, or -2 and so on where it is taken.", *("--out", "-o")
-    )
+    out: Path | None = _output(None, "Folder; geodiff-out, or -2 and so on if taken.", "--out", "-o")
     overwrite: bool = _output(False, "Write into a folder that holds files; do finished pairs anew.")
     strict: bool = _output(False, "End with an error if the result is not to be trusted.")
     export: tuple[str, ...] = _output((), "Also write glb or colmap; repeatable.", choices=("glb", "colmap"))
@@ -274,44 +263,24 @@ class CaptureOptions(PriorOptions):
         metavar="PATH",
     )
     out: Path = _output(Path("geodiff-capture"), "Folder for the results, one folder a frame.", "--out", "-o")
-    frames: str | None = declare(
-        None, "Which frames get depth: NAME,NAME by file stem, or FIRST:LAST:STEP; all by default."
-    )
+    frames: str | None = declare(None, "Which get depth: NAME,NAME or FIRST:LAST:STEP; all by default.")
     neighbours: int = declare(NEIGHBOURS, "Right views of a frame, at most.", low=1, high=32)
-    poses: str = _camera(
-        "refined",
-        "refined: solved together over the capture; given: as they are.",
-        choices=("refined", "given"),
-    )
+    poses: str = _camera("refined", "refined (solved together) or given.", choices=("refined", "given"))
     points: str = declare(
         "tracks",
         "Known depths: tracks (points of the pose solve), none, model (points of a COLMAP model), depth "
         "(maps it names).",
         choices=POINTS,
     )
-    metres_per_unit: float | None = _camera(
-        None, "Length of one unit of the poses, metres.", above_0="metres"
-    )
-    known_length: str | None = _camera(
-        None, "A distance in the scene, NAME:X1,Y1,X2,Y2,METRES by pixels of a frame."
-    )
+    metres_per_unit: float | None = _camera(None, "Metres of a unit of the poses.", above_0="metres")
+    known_length: str | None = _camera(None, "A distance in a frame, NAME:X1,Y1,X2,Y2,METRES by its pixels.")
     distance: str | None = _camera(None, "Distance of two cameras, NAME,NAME,METRES.")
     k: Path | None = _camera(None, "3x3 intrinsics, text or .npy.", "--K")
     fov: float | None = _camera(None, "Horizontal field of view, degrees.")
-    trajectory: Path | None = _camera(
-        None, "Of a video: lines of seconds tx ty tz qx qy qz qw, camera-to-world."
-    )
-    prior_map: Path | None = declare(
-        None, "Folder of depth maps of another model, NAME.npy or another map a frame, in place of a prior."
-    )
-    processes: int | None = declare(
-        None, "Processes that share the frames; by default one a core.", low=1, high=1024
-    )
-    export: tuple[str, ...] = _output(
-        (),
-        "colmap: a dense workspace; mesh: by TSDF (extra mesh); repeatable.",
-        choices=("colmap", "mesh"),
-    )
+    trajectory: Path | None = _camera(None, "Of a video: lines of seconds tx ty tz qx qy qz qw (TUM's).")
+    prior_map: Path | None = declare(None, "Folder of another model's maps, NAME.npy, in place of a prior.")
+    processes: int | None = declare(None, "Processes; by default one a core.", low=1, high=1024)
+    export: tuple[str, ...] = _output((), "colmap (workspace), mesh (TSDF).", choices=("colmap", "mesh"))
     overwrite: bool = _output(False, "Write into a folder that holds files; do finished frames anew.")
     quiet: bool = _output(False, "No progress bar.", "--quiet", "-q")
     json: bool = _output(False, "Print the report instead of a summary.")

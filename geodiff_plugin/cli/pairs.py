@@ -97,6 +97,7 @@ def options_of(ref: PairRef, options: DepthOptions) -> DepthOptions:
 
 
 def _photographs(folder: Path) -> list[Path]:
+    """Images of a folder, sorted as people count: f2 before f10."""
     Image.init()
     paths = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     return sorted((path for path in paths if path.suffix.lower() in Image.EXTENSION), key=natural_order)

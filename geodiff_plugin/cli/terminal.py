@@ -46,10 +46,7 @@ class StopWatch:
 
 @contextmanager
 def collected_warnings(tell: Callable[[str], None] = say) -> Iterator[None]:
-    """Tell every warning of this package once, as a line.
-
-    Warnings of other packages are shown as usual, and the warning filters are restored at the end.
-    """
+    """Tell every warning of this package once, as a line; those of others are shown as usual."""
     with warnings.catch_warnings():
         warnings.filterwarnings("always", category=UserWarning, module=r"geodiff_plugin")
         shown_elsewhere, told = warnings.showwarning, set[str]()
@@ -87,8 +84,7 @@ def new_table(header: Sequence[str], title: str = "") -> Table:
     from rich.table import Table
     from rich.text import Text
 
-    # Text instead of str: a title as str would have its markup read whatever the console says.
-    heading = Text(title, style="bold") if title else None
+    heading = Text(title, style="bold") if title else None  # of a str the markup would be read
     table = Table(box=box.SIMPLE_HEAD, title=heading, title_justify="left")
     for index, name in enumerate(header):
         table.add_column(name, justify="right" if index else "left", overflow="fold")

@@ -172,7 +172,7 @@ def test_what_needs_no_torch_is_said_without_it(pair_files):
 def test_names_that_are_known_without_torch_are_those_with_it():
     import torch
 
-    from geodiff_plugin.cli.results import BENCHMARKS
+    from geodiff_plugin.cli.outputs import BENCHMARKS
     from geodiff_plugin.config import PRESETS as CONFIGS
     from geodiff_plugin.scale import space
 
