@@ -18,7 +18,7 @@ from rich.text import Text
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.cli.depth import Job, load_guided_prior
-from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, check_files, out_folder_of
+from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, start_pair
 from geodiff_plugin.cli.outputs import read_report
 from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, options_of, start_many
 from geodiff_plugin.cli.terminal import collected_warnings, new_table, say, show
@@ -92,10 +92,10 @@ class Stages:
         """Look at the files, take the folder, decode the views."""
         ref: PairRef = item.payload
         options = options_of(ref, self._options)
-        check_files(options, photographs=ref.frame is None)
+        folder = start_pair(options, photographs=ref.frame is None)
         held = self._folders[item.key] = ExitStack()
         with _ends_run_on_full_disk():
-            job = Job(options, held.enter_context(out_folder_of(options)))
+            job = Job(options, held.enter_context(folder))
         digests = _digests(options)  # before: what changes later is another version
         job.entries = {"pair": {"name": ref.name, "frame": ref.frame, "sha256": digests}}
         job.read(None if ref.frame is None else self._frames(ref, ref.frame))

@@ -45,10 +45,7 @@ class DepthOptions(RunOptions):
     """The options of ``geodiff depth`` as they were typed."""
 
     left: Path = declare(
-        MISSING,
-        "Left image; or a folder, a video, a bag, a list: LEFT,RIGHT[,CALIB] a line.",
-        "",
-        metavar="LEFT",
+        MISSING, "Left image, or folder, video, bag, list (LEFT,RIGHT[,CALIB] a line).", "", metavar="LEFT"
     )
     right: Path | None = declare(
         None, "Right image, folder or video; none with --points, or if a video has both.", "", metavar="RIGHT"
@@ -237,18 +234,14 @@ def check_files(options: DepthOptions, photographs: bool = True) -> None:
             check_file(path, name, "a calibration file" if name == "calibration" else "a file")
 
 
-def out_folder_of(options: DepthOptions) -> OutFolder:
-    """The output folder of one pair, which may not hold what the pair is made of."""
+def start_pair(options: DepthOptions, photographs: bool = True) -> OutFolder:
+    """Check the options and files of one pair; its output folder, to be held during the work."""
+    if photographs:  # else frames of a video, whose options are checked once
+        options.check_all()
+        options.cameras_way()
+    check_files(options, photographs)
     assert options.out is not None
     return OutFolder(options.out, inputs=options.read_files(), overwrite=options.overwrite)
-
-
-def start_pair(options: DepthOptions) -> OutFolder:
-    """Check the options and files of one pair; its output folder, to be held during the work."""
-    options.check_all()
-    options.cameras_way()
-    check_files(options)
-    return out_folder_of(options)
 
 
 @dataclass(frozen=True, kw_only=True)
