@@ -1,7 +1,6 @@
 """Calibrations of any rig in every format, by the conventions of the tools that write them."""
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from geodiff_plugin.types import Rig
 #: Names in a COLMAP model and a transforms.json, and the metres of their unit.
 NAMES = "rig/left.jpg", "rig/right.jpg"
 UNIT_M = 0.24
-FISHEYES = ("fisheye_kalibr", "fisheye_orb_slam")
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ def kalibr(rig: Drawn, model: str = "radtan") -> tuple[str, ...]:
     return (yaml.safe_dump(chain),)
 
 
-def fisheye_kalibr(rig: Drawn) -> tuple[str, ...]:
+def kalibr_fisheye(rig: Drawn) -> tuple[str, ...]:
     return kalibr(rig, "equidistant")
 
 
@@ -110,7 +108,7 @@ def orb_slam(rig: Drawn, kind: str = "PinHole", keys: str = "k1 k2 p1 p2") -> tu
     return (text + storage(**{"Stereo.T_c1_c2": np.linalg.inv(rig.T)}).partition("---\n")[2],)
 
 
-def fisheye_orb_slam(rig: Drawn) -> tuple[str, ...]:
+def orb_slam_fisheye(rig: Drawn) -> tuple[str, ...]:
     return orb_slam(rig, "KannalaBrandt8", "k1 k2 k3 k4")
 
 
@@ -135,9 +133,8 @@ def zed(rig: Drawn) -> tuple[str, ...]:
         text += f"[{side}_CAM_2K]\nfx=1400\nfy=1400\ncx=1100\ncy=620\nk1=0\n\n"
     shift = zip(("Baseline", "TY", "TZ"), -1000 * rig.T[:3, 3], strict=True)
     turn = Rotation.from_matrix(rig.T[:3, :3]).as_rotvec()
-    turns = zip(
-        (f"{key}_{size}" for size in ("HD", "2K") for key in ("RX", "CV", "RZ")), [*turn] * 2, strict=True
-    )
+    keys = (f"{key}_{size}" for size in ("HD", "2K") for key in ("RX", "CV", "RZ"))
+    turns = zip(keys, [*turn] * 2, strict=True)
     text += "[STEREO]\n" + "".join(f"{key}={float(value)!r}\n" for key, value in (*shift, *turns))
     return (text + "\n[MISC]\nSensor_ID=0\n",)
 
@@ -195,9 +192,7 @@ def _sfm(rig: Drawn) -> list[np.ndarray]:
 
 
 def colmap(rig: Drawn) -> tuple[str, ...]:
-    cameras = (
-        "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
-    )
+    cameras = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, PARAMS[]\n"
     for n in range(2):
         fx, fy, cx, cy = rig.numbers(n)  # the first pixel's centre lies at half a pixel
         numbers = words([fx, fy, cx + 0.5, cy + 0.5, *rig.lenses[n]])
@@ -228,7 +223,7 @@ def middlebury(rig: Drawn) -> tuple[str, ...]:
     return (text + f"width={rig.size[0]}\nheight={rig.size[1]}\nndisp=64\n",)
 
 
-def middeval3(rig: Drawn) -> tuple[str, ...]:
+def middlebury_blanks(rig: Drawn) -> tuple[str, ...]:
     """The same with blanks around everything."""
     text = middlebury(rig)[0].replace("[", "[ ").replace("]", " ] ").replace("=", "= ")
     return ("\n ".join(text.splitlines()) + "\n",)
@@ -285,38 +280,23 @@ def ros_echo(rig: Drawn) -> tuple[str, ...]:
     )
 
 
-#: Formats of any pose and of rectified pairs, by the function that writes them: the name in the table.
-ANY_POSE: dict[Callable[[Drawn], tuple[str, ...]], str] = {
-    **{
-        opencv: "opencv",
-        kalibr: "kalibr",
-        euroc: "euroc",
-        orb_slam: "orb_slam",
-        mvsnet: "mvsnet",
-        zed: "zed",
-    },
-    **{realsense: "realsense", realsense_printed: "realsense", oak: "oak", colmap: "colmap", nerf: "nerf"},
-    **{fisheye_kalibr: "kalibr", fisheye_orb_slam: "orb_slam"},
-}
-RECTIFIED: dict[Callable[[Drawn], tuple[str, ...]], str] = {
-    **{middlebury: "middlebury", middeval3: "middlebury", kitti_cam_to_cam: "kitti_cam_to_cam"},
-    **{kitti_projections: "kitti_projections", booster: "booster", stereodemo: "stereodemo", ros: "ros"},
-    **{opencv_projections: "opencv", ros_echo: "ros"},
-}
-#: Those with one camera for both images.
-ONE_CAMERA = {foundation_stereo: "foundation_stereo", orb_slam_rectified: "orb_slam"}
+#: Formats of any pose and of rectified pairs, and those with one camera for both images: the function's name
+#: begins with that of the format.
+ANY_POSE = (
+    *(opencv, kalibr, euroc, orb_slam, mvsnet, zed, realsense, realsense_printed, oak, colmap, nerf),
+    *(kalibr_fisheye, orb_slam_fisheye),
+)
+RECTIFIED = (
+    *(middlebury, middlebury_blanks, kitti_cam_to_cam, kitti_projections, booster, stereodemo, ros, ros_echo),
+    opencv_projections,
+)
+ONE_CAMERA = (foundation_stereo, orb_slam_rectified)
 
 #: A rig of 0.12 m in every format, by the name of the function.
 K = np.array([[700.0, 0, 300], [0, 700.0, 200], [0, 0, 1]])
-RIG = Drawn(
-    (K, K), rigid([0, 0, 0], [-0.12, 0, 0]), (640, 480), ([0.0] * 4, [0.0] * 4), rigid([0, 0, 0], [1, 2, 3])
-)
-FORMAT_OF = {write.__name__: name for write, name in (ANY_POSE | RECTIFIED | ONE_CAMERA).items()}
-SAMPLES = {
-    write.__name__: write(RIG)
-    for write in ANY_POSE | RECTIFIED | ONE_CAMERA
-    if write.__name__ not in FISHEYES
-}
+SHIFT, WORLD = rigid([0, 0, 0], [-0.12, 0, 0]), rigid([0, 0, 0], [1, 2, 3])
+RIG = Drawn((K, K), SHIFT, (640, 480), ([0.0] * 4, [0.0] * 4), WORLD)
+SAMPLES = {w.__name__: w(RIG) for w in ANY_POSE + RECTIFIED + ONE_CAMERA if "fisheye" not in w.__name__}
 
 
 def choice(sample: str, baseline_m: float = 0.12) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.formats import CALIBRATION_FORMATS, read_calibration, rig_from_parameters
 from tests.contracts import calibrations as of
-from tests.contracts.calibrations import FORMAT_OF, SAMPLES, choice, rigid, written
+from tests.contracts.calibrations import SAMPLES, choice, rigid, written
 
 TAKE = settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
 #: A file that only warns: doffs cut to fewer digits disagrees with cam1.
@@ -57,7 +57,7 @@ def test_a_rig_of_any_pose_is_read_as_it_was_written(tmp_path, write, drawn):
         return
     assert rig.size_left == rig.size_right == choices.get("image_size", drawn.size)
     for lens, expected in zip(rig.distortion, drawn.lenses, strict=True):
-        assert lens.model == ("fisheye" if write.__name__ in of.FISHEYES else "opencv")
+        assert lens.model == ("fisheye" if "fisheye" in write.__name__ else "opencv")
         numbers = lens.coefficients.tolist()
         assert numbers[:4] == expected and not any(numbers[4:])
 
@@ -78,7 +78,7 @@ def test_a_sample_is_recognised_as_its_own_format_and_read_whatever_its_line_end
     texts = SAMPLES[sample]
     for text in texts:
         formats = CALIBRATION_FORMATS.items()
-        assert FORMAT_OF[sample] == next(name for name, each in formats if re.search(each.mark, text, re.M))
+        assert sample.startswith(next(name for name, each in formats if re.search(each.mark, text, re.M)))
     paths = written(tmp_path, texts)
     plain = read_calibration(paths, **choice(sample))
     assert pytest.approx(np.linalg.inv(of.RIG.T), abs=1e-9) == plain.E and "file0.dat" in plain.source
@@ -91,7 +91,7 @@ def test_a_sample_is_recognised_as_its_own_format_and_read_whatever_its_line_end
 
 
 def test_every_format_has_a_sample():
-    assert set(FORMAT_OF.values()) == set(CALIBRATION_FORMATS)
+    assert all(any(sample.startswith(name) for sample in SAMPLES) for name in CALIBRATION_FORMATS)
 
 
 @pytest.mark.parametrize("sample", SAMPLES)
@@ -115,30 +115,20 @@ REFUSALS = [
     ("middlebury", "baseline=120.0", "baseline=0", "baseline must be above 0"),
     ("middlebury", "200.0; 0.0 0.0 1.0]\ndoffs", "200.0; 0.0 0.0\ndoffs", "cam1 must be"),
     ("middlebury", "doffs=0.0", "doffs=", "could not convert"),
-    ("middlebury", "width=640", "width=x", "the width and height of the left camera must be 2 finite numb"),
     ("kitti_projections", "P1:", "X1:", "two different cameras of the file .0.; got 0,0"),
-    ("kitti_projections", "700.0 0.0 300.0", "700.0 300.0", "P0 must be 12 finite numbers; got 11"),
     ("foundation_stereo", "0.12", "", "9 numbers of K and the baseline in metres; got 9 numbers.*--K"),
-    ("stereodemo", '"baseline_meters": 0.12, ', "", "no 'baseline_meters'"),
     ("stereodemo", '"fx": 700.0', '"fx": "a"', r"fx, fy, cx, cy must be 4 finite numbers; got \('a', 700"),
     ("stereodemo", "700.0", "9" * 5000, "must be a whole stereodemo JSON"),
     ("opencv", "1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0", "1.5, 0, 0, 0, 1.5, 0, 0, 0, 1.5",
      "R, T must be rigid.*rotation"),
-    ("opencv", "-0.12, 0.0, 0.0", "0, 0", "translation of R, T must be 3 finite numbers; got 2"),
     ("opencv", "[ 0.0, 0.0, 0.0, 0.0 ]\nM2", "[ 0.1, 0.0, 0.0, 0.0 ]\nM2", "of the left .*rectify"),
     ("opencv", "[ 0.0, 0.0, 0.0, 0.0 ]\nR", "[ 1, 2, 3 ]\nR", "right camera must be 4, 5, 8, 12, 14 co"),
     ("opencv", "D2:", "dist_of_right:", r"both cameras \(D1, D2\); got dist_of_right. Rename"),
     ("opencv", "0.0, 0.0, 0.0, 0.0 ]\nR", "0.1, 0.0, 0.0, 0.0 ]\nD1: 3\nR", r"\(D1, D2\); got one of them"),
     ("opencv", "D2:", "mtxL:", "M1 must be there once; got m1, mtxl, which differ"),
-    ("opencv", "T:", "X:", "no T. Where intrinsics and extrinsics are two files, give both"),
-    ("opencv", "[ 640.0", "[ 640.5", "must be whole numbers of pixels"),
     ("booster", "<opencv_storage>", '<!DOCTYPE x [<!ENTITY a "b">]><opencv_storage>', "entities"),
     ("booster", "</opencv_storage>", "", "must be a whole Booster xml"),
-    ("mvsnet", "extrinsic\n1.0", "extrinsic\n1.1", "extrinsic must be rigid: .*scale"),
     ("mvsnet", "0.0 0.0 0.0 1.0\n\nintrinsic", "1.0 0.0 0.0 1.0\n\nintrinsic", "last row .*transposed"),
-    ("mvsnet", "\nintrinsic", "\nextra", "K of the right camera must be 9 finite numbers; got 0"),
-    ("zed", "fx=700.0", "fx=x", "fx, fy, cx, cy must be 4 finite numbers; got .'x'"),
-    ("zed", "k1=0.0", "k1=-0.17", "Lens distortion of the left camera .* Undistort"),
     ("zed", "TY=", "TX=", "Baseline, TY, TZ of .STEREO. must be 3 finite numbers"),
     ("realsense", '"translation"', '"moved"', "their extrinsics; got 2 and 0"),
     ("realsense_printed", 'To  "Infrared 2"', 'To  "Depth"', "with .Infrared 1.*less.*cut off"),
@@ -147,27 +137,18 @@ REFUSALS = [
     ("ros", "projection_matrix:", "projektion:", "projection_matrix must be 12 finite numbers; got None"),
     ("all:ros_echo", "p: [", "p: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0] # [", "focal lengths in pixels; got 0"),
     ("kalibr", "camera_model: pinhole", "camera_model: omni", "camera_model must be pinhole; got 'omni'"),
-    ("kalibr", "cam1:", "cam3:", "two different cameras of the file .0.; got 0,1"),
-    ("kalibr", "radtan", "fov", "lens model.*got fov.*undistort"),
-    ("kalibr", "radtan", "equidistant", "Lens distortion of the left camera .* got fisheye"),
-    ("euroc", "distortion_model: radial", "distortion_model: odd", "lens model of the right camera.*got odd"),
     ("euroc", "- 640", "- 640.5", "width and height of the right camera must be whole numbers"),
-    ("euroc", "data:\n  - 1", "data:\n  # - 1", "T_BS must be 16 finite numbers; got 15"),
     ("orb_slam_rectified", "ThDepth: 35", "DepthMapFactor: 5000", "got of .* with a depth sensor"),
     ("orb_slam_rectified", "Camera.bf: 84.0", "", "with Stereo.T_c1_c2, or Camera.bf of rectified"),
     ("orb_slam_rectified", "Camera.k1: 0.0", "Camera.k1: 0.2", "Lens distortion of Camera must be zero"),
-    ("orb_slam_rectified", "Camera.height: 480", "", "width and height of the left camera must be 2 finite"),
     ("orb_slam", "PinHole", "Rectified", "Camera.type must be PinHole or KannalaBrandt8 beside Stereo"),
     ("orb_slam", "PinHole", "KannalaBrandt8", "Camera1.k3 must be a finite number"),
     ("all:colmap", "OPENCV 640", "SIMPLE_RADIAL 640", "of camera 1 must be 4 finite numbers; got 8"),
     ("all:colmap", "OPENCV 640", "FISHY 640", "model of camera 1 must be one of SIMPLE_PINH.*Undistort"),
     ("colmap", " 2 rig/right", " 7 rig/right", "with cameras 1 and 7; got only 1, 2"),
     ("colmap", "\n3 1.0", "\n3 0.0", "must be a whole COLMAP model"),
-    ("nerf", '"OPENCV"', '"EQUIRECTANGULAR"', "lens model of the left camera .* got EQUIRECTANGULAR"),
     ("nerf", '"k1"', '"k4": 0.1, "k1"', "k4 must be zero for OPENCV; got .0.1."),
     ("nerf", '"k1"', '"distortion_params": [0.1], "k1"', "k1, .* must be 6 finite numbers; got 1"),
-    ("nerf", '"frames": [', '"frames": {"0": [', "must be a whole transforms.json"),
-    ("nerf", "[[1.0, 0.0", "[[2.0, 0.0", "transform_matrix must be rigid: .*scale"),
 ]  # fmt: skip
 
 
@@ -185,13 +166,10 @@ def test_a_wrong_entry_is_named(tmp_path, sample, old, new, said):
 @pytest.mark.parametrize(
     ("sample", "given_", "said"),
     [
-        ("kitti_projections", {"cameras": (2, 3)}, r"two different cameras of the file \(0, 1\); got 2,3"),
         ("kitti_projections", {"cameras": (0, 0)}, "two different cameras"),
         ("foundation_stereo", {"cameras": (0, 1)}, "cameras must be left out"),
-        ("kalibr", {"cameras": (0, 2)}, r"two different cameras of the file \(0, 1\); got 0,2"),
         ("kalibr", {"cameras": ("a", 1)}, "two different cameras.*got a,1"),
         ("kalibr", {"baseline_m": -1.0}, "baseline_m"),
-        ("oak", {"cameras": (1, 5)}, r"two different cameras of the file \(0, 1, 2\); got 1,5"),
         ("oak", {"image_size": (1280, 720)}, "640x480.*crop"),
         ("zed", {"image_size": None}, "1280x720, 2208x1242.*got no image"),
         ("zed", {"image_size": (2560, 720)}, "1280x720, 2208x1242"),

@@ -33,18 +33,8 @@ COMMON: dict[str, Any] = {
 EXAMPLES = settings(max_examples=25, **COMMON)
 MANY = settings(max_examples=int(os.environ.get("GEODIFF_FUZZ", "1500")), **COMMON)
 
-WORDS = b"nan inf -inf 1e999 -1 0 1e-300 [ ] { } : , ; = < > 1e5 # rows:"
-TOKENS = [
-    *WORDS.split(),
-    b"\n",
-    b" ",
-    b'"',
-    b"\0",
-    b"\xff\xfe",
-    b"9" * 400,
-    b"[" * 3000,
-    b"rows: 99999999999",
-]
+WORDS = b'nan inf -inf 1e999 -1 0 1e-300 [ ] { } : , ; = < > 1e5 # " rows:'
+TOKENS = [*WORDS.split(), b"\n", b" ", b"\0", b"\xff\xfe", b"9" * 400, b"[" * 3000, b"rows: 99999999999"]
 
 
 @st.composite
@@ -54,13 +44,10 @@ def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
     for _ in range(draw(st.integers(0, 4))):
         start = draw(st.integers(0, max(0, len(data))))
         stop = min(len(data), start + draw(st.sampled_from([0, 1, 2, 8, 64, len(whole)])))
-        pieces = [
-            b"",
-            draw(st.sampled_from(TOKENS)),
-            draw(st.binary(max_size=8)),
-            bytes(data[start:stop]) * 2,
-        ]
-        data[start:stop] = draw(st.sampled_from(pieces))
+        twice = bytes(data[start:stop]) * 2
+        data[start:stop] = draw(
+            st.just(b"") | st.sampled_from(TOKENS) | st.binary(max_size=8) | st.just(twice)
+        )
     return bytes(data)
 
 
@@ -106,9 +93,7 @@ def point_files() -> dict[str, bytes]:
 def file_names() -> st.SearchStrategy[str]:
     """Names as a file system may have them, and longer ones."""
     text = st.text(st.characters(blacklist_characters="\0"), min_size=1, max_size=300)
-    return st.one_of(
-        text, st.sampled_from(["x" * 300, "a/" * 2500, "~", "-", "..", "/dev/null", "/dev/zero"])
-    )
+    return text | st.sampled_from(["x" * 300, "a/" * 2500, "~", "-", "..", "/dev/null", "/dev/zero"])
 
 
 def _array(shape: tuple[int, ...], kind: str, fill: float) -> np.ndarray:
@@ -126,15 +111,12 @@ def junk() -> st.SearchStrategy[Any]:
     kinds = ["f4", "f8", "u1", "u2", "i8", "?", "c8", "O", "U3"]
     fills = [0.0, 1.0, -1.0, 0.5, 300.0, np.nan, np.inf]
     arrays = st.builds(_array, *map(st.sampled_from, (shapes, kinds, fills)))
-    return st.recursive(
-        st.one_of(few, arrays, st.just(object())),
-        lambda inner: st.one_of(
-            st.lists(inner, max_size=3),
-            st.lists(inner, max_size=3).map(tuple),
-            st.dictionaries(st.text(max_size=4), inner, max_size=2),
-        ),
-        max_leaves=4,
-    )
+
+    def nested(inner: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+        several = st.lists(inner, max_size=3)
+        return several | several.map(tuple) | st.dictionaries(st.text(max_size=4), inner, max_size=2)
+
+    return st.recursive(st.one_of(few, arrays, st.just(object())), nested, max_leaves=4)
 
 
 def _too_long(*_: Any) -> None:
@@ -201,10 +183,11 @@ def test_points(tmp_path, suffix, size):
     eye = "1 0 0 0 1 0 0 0 1"
     calib.write_text(f"P2: 700 0 320 0 0 700 240 0 0 0 1 0\nR0_rect: {eye}\nTr_velo_to_cam: {eye} 0 0 0\n")
     given_too = {"calibration": (calib,)} if suffix == ".bin" else {}
-    scales = st.sampled_from([None, 256.0, 1e-9, 1e9])
-    survives_damage(
-        size, path, POINT_FILES[suffix], lambda scale: read_points(path, scale=scale, **given_too), scales
-    )
+
+    def read(scale):
+        read_points(path, scale=scale, **given_too)
+
+    survives_damage(size, path, POINT_FILES[suffix], read, st.sampled_from([None, 256.0, 1e-9, 1e9]))
 
 
 @pytest.mark.parametrize("kind", IMAGES)
@@ -232,10 +215,7 @@ def test_arguments_of_the_guidance(size):
     some = st.sampled_from([name for name in KNOBS if name != "weights"])
 
     @size
-    @given(
-        given_=st.dictionaries(names, junk(), min_size=1, max_size=3),
-        knobs=st.dictionaries(some, junk(), max_size=2),
-    )
+    @given(st.dictionaries(names, junk(), min_size=1, max_size=3), st.dictionaries(some, junk(), max_size=2))
     def check(given_, knobs):
         survives(lambda: GeometryGuidance(**GOOD | given_, **knobs))
 

@@ -12,12 +12,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from geodiff_plugin._checks import InputError
 from geodiff_plugin.formats import (
     Cloud,
     atomic_path,
     flying_points,
-    make_cloud,
     read_calibration,
     read_depth_png,
     read_pfm,
@@ -28,7 +26,6 @@ from geodiff_plugin.formats import (
     write_pfm,
     write_ply,
 )
-from geodiff_plugin.formats.sfm import model_files, read_colmap_model, read_colmap_points
 from tests.contracts.calibrations import SAMPLES, choice
 
 TAKE = settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
@@ -36,6 +33,11 @@ SIDES = st.integers(1, 9)
 SHAPES = st.tuples(SIDES, SIDES)
 FLOATS = st.floats(width=32, allow_nan=False)
 K = np.array([[10.0, 0, 2], [0, 20.0, 1], [0, 0, 1]])
+
+K_60 = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
+C, S = np.cos(0.1), np.sin(0.1)
+E = np.array([[C, 0, S, 0.12], [0, 1, 0, 0], [-S, 0, C, 0], [0, 0, 0, 1]])
+LEFT, EMPTY = (K_60, np.eye(4), (64, 48)), Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 
 def names(folder: Path) -> list[str]:
@@ -89,6 +91,7 @@ def test_depth_in_metres_and_millimetres_comes_back(tmp_path):
         (lambda f: write_ply(f / "d.ply", np.ones((3, 4)), np.zeros((4, 3, 3)), K), "image_01"),
         (lambda f: write_ply(f / "d.ply", np.ones((3, 4)), np.zeros((3, 4, 3)), 0 * K), "focal"),
         (lambda f: write_depth_npy(f, np.zeros((2, 3))), "folder"),
+        (lambda f: write_colmap(f, [("my left.png", *LEFT)], EMPTY), "without blanks"),
     ],
 )
 def test_what_cannot_be_written_leaves_nothing(tmp_path, write, said):
@@ -99,14 +102,12 @@ def test_what_cannot_be_written_leaves_nothing(tmp_path, write, said):
 
 def read_ply(path: Path) -> np.ndarray:
     head, _, body = path.read_bytes().partition(b"end_header\n")
-    lines = head.decode("ascii").split("\n")
+    lines, kinds = head.decode("ascii").split("\n"), {"float": "<f4", "uchar": "u1"}
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    count = int(next(line for line in lines if line.startswith("element vertex")).split()[-1])
-    kinds = {"float": "<f4", "uchar": "u1"}
-    properties = [tuple(line.split()[1:]) for line in lines if line.startswith("property")]
-    dtype = np.dtype([(name, kinds[kind]) for kind, name in properties])
-    assert len(body) == count * dtype.itemsize
-    return np.frombuffer(body, dtype=dtype)
+    properties = [line.split()[1:] for line in lines if line.startswith("property")]
+    rows = np.frombuffer(body, dtype=[(name, kinds[kind]) for kind, name in properties])
+    assert f"element vertex {len(rows)}" in lines
+    return rows
 
 
 def test_convention_ply_camera_frame(tmp_path):
@@ -123,7 +124,6 @@ def test_convention_ply_camera_frame(tmp_path):
     np.testing.assert_allclose(points["z"], depth[rows, columns], rtol=1e-6)
     for channel, name in enumerate(("red", "green", "blue")):
         np.testing.assert_array_equal(points[name], np.rint(image[rows, columns, channel] * 255))
-    assert write_ply(tmp_path / "c.ply", 0 * depth, image, K) == len(read_ply(tmp_path / "c.ply")) == 0
 
 
 def test_flying_points_keep_planes_and_clean_edges():
@@ -133,7 +133,7 @@ def test_flying_points_keep_planes_and_clean_edges():
         assert not flying_points(depth).any()
 
 
-@pytest.mark.parametrize("angle", [0, 30, 45, 70, 90])
+@pytest.mark.parametrize("angle", [0, 30, 90])
 def test_flying_points_find_a_ramp_between_two_surfaces(angle):
     v, u = np.mgrid[0:60, 0:60]
     across = np.cos(np.deg2rad(angle)) * (u - 30) + np.sin(np.deg2rad(angle)) * (v - 30)
@@ -141,82 +141,44 @@ def test_flying_points_find_a_ramp_between_two_surfaces(angle):
     assert flying[np.abs(across) < 1.4].mean() > 0.95 and not flying[np.abs(across) > 3].any()
 
 
-K_60 = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
-C, S = np.cos(0.1), np.sin(0.1)
-E = np.array([[C, 0, S, 0.12], [0, 1, 0, 0], [-S, 0, C, 0], [0, 0, 0, 1]])
-LEFT, EMPTY = (K_60, np.eye(4), (64, 48)), Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-
-
 def parse_glb(path) -> tuple[dict, bytes]:
     raw = path.read_bytes()
-    magic, version, length = struct.unpack_from("<4sII", raw)
-    assert (magic, version, length) == (b"glTF", 2, len(raw))
-    count, kind = struct.unpack_from("<I4s", raw, 12)
-    assert kind == b"JSON" and count % 4 == 0
-    scene = json.loads(raw[20 : 20 + count])
-    if length == 20 + count:
-        return scene, b""
-    size, kind = struct.unpack_from("<I4s", raw, 20 + count)
-    assert kind == b"BIN\0" and 28 + count + size == length
-    return scene, raw[28 + count :]
+    magic, version, length, count, kind = struct.unpack_from("<4sIII4s", raw)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(raw), b"JSON") and count % 4 == 0
+    binary = raw[20 + count :]
+    assert binary[:8] == (struct.pack("<I4s", len(binary) - 8, b"BIN\0") if binary else b"")
+    return json.loads(raw[20 : 20 + count]), binary[8:]
 
 
 def accessor(scene: dict, data: bytes, number: int) -> np.ndarray:
     entry = scene["accessors"][number]
-    view = scene["bufferViews"][entry["bufferView"]]
-    assert view["byteOffset"] % 4 == 0
+    begin, size = (scene["bufferViews"][entry["bufferView"]][key] for key in ("byteOffset", "byteLength"))
+    assert begin % 4 == 0
     kind = {5126: "<f4", 5121: "u1", 5125: "<u4"}[entry["componentType"]]
-    width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[entry["type"]]
-    raw = data[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
-    return np.frombuffer(raw, kind).reshape(entry["count"], width)
+    return np.frombuffer(data[begin : begin + size], kind).reshape(entry["count"], -1)
 
 
-def test_glb_turns_the_axes_and_keeps_colours(tmp_path):
+def test_glb_turns_the_axes_and_its_cameras_look_at_the_cloud(tmp_path):
     cloud = Cloud(np.array([[1.0, -1.0, 1.0], [0, 0, 2]]), np.array([[255, 0, 9], [1, 2, 3]], np.uint8))
-    write_glb(tmp_path / "a.glb", cloud)
+    write_glb(tmp_path / "a.glb", cloud, [LEFT, (K_60, E, (64, 48))])
     scene, data = parse_glb(tmp_path / "a.glb")
-    primitive = scene["meshes"][0]["primitives"][0]
-    positions, colours = (primitive["attributes"][name] for name in ("POSITION", "COLOR_0"))
-    assert primitive["mode"] == 0
+    assert [mesh["name"] for mesh in scene["meshes"]] == ["cloud", "camera 0", "camera 1"]
+    points, lines = (scene["meshes"][i]["primitives"][0] for i in (0, 2))
+    assert (points["mode"], lines["mode"]) == (0, 1) and accessor(scene, data, lines["indices"]).max() == 4
+    positions, colours = (points["attributes"][name] for name in ("POSITION", "COLOR_0"))
     assert accessor(scene, data, positions).tolist() == [[1, 1, -1], [0, 0, -2]]
     assert accessor(scene, data, colours).tolist() == [[255, 0, 9, 255], [1, 2, 3, 255]]
-    bounds = scene["accessors"][positions]
-    assert bounds["min"] == [0, 0, -2] and bounds["max"] == [1, 1, -1]
+    assert [scene["accessors"][positions][key] for key in ("min", "max")] == [[0, 0, -2], [1, 1, -1]]
+    corners = accessor(scene, data, lines["attributes"]["POSITION"])
+    np.testing.assert_allclose(corners[0], [0.12, 0, 0], atol=1e-6)
+    middle = corners[1:].mean(0) - corners[0]
+    np.testing.assert_allclose(middle / np.linalg.norm(middle), [S, 0, -C], atol=1e-6)
     write_glb(tmp_path / "a.glb", EMPTY)
     scene, data = parse_glb(tmp_path / "a.glb")
     assert scene["scenes"] == [{}] and data == b""
 
 
-def test_glb_cameras_look_at_the_cloud(tmp_path):
-    cloud = make_cloud(np.full((48, 64), 2.0), np.zeros((48, 64, 3)), K_60)
-    write_glb(tmp_path / "a.glb", cloud, [LEFT, (K_60, E, (64, 48))])
-    scene, data = parse_glb(tmp_path / "a.glb")
-    assert [mesh["name"] for mesh in scene["meshes"]] == ["cloud", "camera 0", "camera 1"]
-    lines = scene["meshes"][2]["primitives"][0]
-    assert lines["mode"] == 1 and accessor(scene, data, lines["indices"]).max() == 4
-    corners = accessor(scene, data, lines["attributes"]["POSITION"])
-    np.testing.assert_allclose(corners[0], [0.12, 0, 0], atol=1e-6)
-    assert (corners[1:, 2] < 0).all()  # before the camera is -z
-    middle = corners[1:].mean(0) - corners[0]
-    np.testing.assert_allclose(middle / np.linalg.norm(middle), [S, 0, -C], atol=1e-6)
-
-
-def test_colmap_comes_back_through_the_reader(tmp_path):
-    cloud = make_cloud(np.full((48, 64), 2.0), np.full((48, 64, 3), 0.5), K_60)
-    write_colmap(tmp_path, [("left.png", *LEFT), ("right.png", K_60, E, (64, 48))], cloud)
-    rig = read_calibration(tmp_path, image_names=("left.png", "right.png"), baseline_m=0.12)
-    np.testing.assert_allclose(rig.K_left, K_60)
-    np.testing.assert_allclose(rig.E, E, atol=1e-9)
-    assert rig.size_right == (64, 48)
-    lines = [line for line in (tmp_path / "points3D.txt").read_text().splitlines() if line[0] != "#"]
-    assert len(lines) == 48 * 64
-    assert lines[0].split()[3:] == ["2.00000", "128", "128", "128", "0"]
-    with pytest.raises(ValueError, match="without blanks"):
-        write_colmap(tmp_path, [("my left.png", *LEFT)], EMPTY)
-
-
 CAMERAS, IMAGES = SAMPLES["colmap"]
-POINTS = "# 3D point list\n17 1 -2 3.5 10 20 255 0.25 1 0 2 0 3 0\n18 1 -2 4.5 10 20 255 0.25 1 1 3 1\n"
 
 
 def test_a_model_of_many_images_is_read_without_its_points(tmp_path, monkeypatch):
@@ -236,41 +198,3 @@ def test_a_model_of_many_images_is_read_without_its_points(tmp_path, monkeypatch
     (tmp_path / "images.txt").write_text(points)
     with pytest.raises(ValueError, match="calibration must be a calibration file.*; got .* bytes"):
         read_calibration(tmp_path, **choice("colmap"))
-
-
-@pytest.fixture
-def models(tmp_path):
-    """Folders of the sample's model in text and in COLMAP's binary, with a point that three images see."""
-    pycolmap = pytest.importorskip("pycolmap")
-    text, binary = tmp_path / "txt", tmp_path / "bin"
-    first, other, right = IMAGES.split("320.5 240.25 17\n")[:3]
-    seen = "320.5 240.25 17", " 30 40 18"  # the second point is not seen by the other image
-    images = f"{first}{seen[0]}{seen[1]}\n{other}{seen[0]}\n{right}{seen[0]}{seen[1]}\n"
-    for folder in (text, binary):
-        folder.mkdir()
-    for name, content in (("cameras", CAMERAS), ("images", images), ("points3D", POINTS)):
-        (text / f"{name}.txt").write_text(content)
-    pycolmap.Reconstruction(str(text)).write_binary(str(binary))
-    return text, binary
-
-
-def test_binary_models_are_those_in_text_and_known_points_are_seen_three_times(models):
-    rigs = [read_calibration(folder, **choice("colmap")) for folder in models]
-    np.testing.assert_array_equal(rigs[0].E, rigs[1].E)
-    np.testing.assert_array_equal([rig.K_left for rig in rigs], [rigs[0].K_left] * 2)
-    (cameras, images), (others, twins) = (read_colmap_model(model_files(folder)) for folder in models)
-    assert cameras.keys() == others.keys() == {1, 2} and cameras[1].size == others[1].size == (640, 480)
-    for name, (number, T, camera) in images.items():
-        assert (number, camera) == (twins[name][0], twins[name][2])
-        np.testing.assert_allclose(T, twins[name][1], atol=1e-12)
-    for folder in models:
-        points = read_colmap_points(folder)
-        assert points.keys() == {1, 2, 3} and all(xyz.tolist() == [[1, -2, 3.5]] for xyz in points.values())
-
-
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_a_cut_off_binary_file_is_named(models, name):
-    path = models[1] / name
-    path.write_bytes(path.read_bytes()[:-3])
-    with pytest.raises(InputError, match=rf"{name} must be a binary COLMAP file; got less.*cut off"):
-        read_colmap_points(models[1]) if name[0] == "p" else read_calibration(models[1], **choice("colmap"))

@@ -41,26 +41,18 @@ def heard(value) -> list[str]:
     return [str(w.message) for w in said]
 
 
-#: EXIF orientation -> the upright image, by the definition of the eight.
-UPRIGHT = {
-    1: X,
-    2: X[:, ::-1],
-    3: X[::-1, ::-1],
-    4: X[::-1],
-    5: X.transpose(1, 0, 2),
-    6: X[::-1].transpose(1, 0, 2),
-    7: X[::-1, ::-1].transpose(1, 0, 2),
-    8: X[:, ::-1].transpose(1, 0, 2),
-}
+#: Ways to mirror an image; EXIF's orientations 1 to 4 do so, 5 to 8 change rows and columns then.
+FLIPS = [X, X[:, ::-1], X[::-1, ::-1], X[::-1]]
+UPRIGHT = [*FLIPS, *(FLIPS[i].transpose(1, 0, 2) for i in (0, 3, 2, 1))]
 
 
-@pytest.mark.parametrize("orientation", UPRIGHT)
+@pytest.mark.parametrize("orientation", range(1, 9))
 def test_exif_orientation_is_applied_and_told(tmp_path, orientation):
     exif = Image.Exif()
     exif[0x0112] = orientation
     image, notes = read_image(saved(tmp_path, PIL, exif=exif), "right")
     assert image.dtype == np.float32
-    np.testing.assert_array_equal(image, UPRIGHT[orientation])
+    np.testing.assert_array_equal(image, UPRIGHT[orientation - 1])
     assert len(notes) == (orientation > 1)
     assert all(note.startswith("right was turned") and "K must belong" in note for note in notes)
     buffer = io.BytesIO()
@@ -98,21 +90,6 @@ def test_10_and_12_bits_in_16_are_told_once(tmp_path, times, told):
     for value in (*kinds, Image.fromarray(grey)):
         assert ["nearly black" in sentence for sentence in heard(value)] == [True] * told
     assert heard(RAMP // 8) == []
-
-
-@pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "webp"])
-@pytest.mark.filterwarnings("ignore")  # Pillow's remarks about broken TIFF tags
-def test_a_cut_off_image_is_a_sentence(tmp_path, suffix):
-    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
-    path = saved(tmp_path, Image.fromarray(noise), f"cut.{suffix}")
-    whole = path.read_bytes()
-    for share in (0.02, 0.3, 0.6, 0.9):
-        path.write_bytes(whole[: int(len(whole) * share)])
-        with pytest.raises(ValueError, match=r"left must be .*cut\."):
-            read_image(path)
-    path.write_bytes(b"hello")
-    with pytest.raises(ValueError, match="a format that Pillow does not read"):
-        read_image(path)
 
 
 @pytest.mark.parametrize("channels", [3, 4])
@@ -167,7 +144,6 @@ TENSOR = torch.from_numpy(X).permute(2, 0, 1)
     [
         (PIL, 0),
         (RAMP, 0),
-        (RAMP.astype(np.uint16) * 257, 1e-6),
         ((RAMP.astype(np.uint16) * 257).astype(">u2"), 1e-6),  # another byte order
         (RAMP / 255.0, 1e-6),
         (torch.from_numpy(RAMP).permute(2, 0, 1), 0),
@@ -194,8 +170,7 @@ def with_value(value):
     ("value", "error", "match"),
     [
         (with_value(-0.9), ValueError, r"-0\.9.*\(x \+ 1\) / 2"),
-        (np.zeros((1, H, W, 3)), ValueError, "batch"),
-        (torch.zeros(1, 3, H, W), ValueError, r"value\[0\]"),
+        (np.zeros((1, H, W, 3)), ValueError, r"batch: value\[0\]"),
         (torch.zeros(H, W), ValueError, r"value\[None\]"),
         (torch.zeros(H, W, 3), ValueError, r"permute\(2, 0, 1\)"),
         (np.zeros((H, W, 2)), ValueError, "1, 3 or 4 channels"),

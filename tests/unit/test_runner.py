@@ -50,10 +50,9 @@ def test_a_second_run_does_what_is_missing(tmp_path, stages):
         calls.append(item.payload)
         return {"square": item.payload**2}
 
-    assert [r["square"] for r in go(tmp_path, work, 3, stages)] == [0, 1, 4]
-    assert [r["square"] for r in go(tmp_path, work, 5, stages)] == [0, 1, 4, 9, 16]
-    assert calls == [0, 1, 2, 3, 4]
-    assert [path.name for path in tmp_path.iterdir()] == ["job.jsonl"]
+    for count in (3, 5):
+        assert [r["square"] for r in go(tmp_path, work, count, stages)] == [0, 1, 4, 9, 16][:count]
+    assert calls == [0, 1, 2, 3, 4] and [path.name for path in tmp_path.iterdir()] == ["job.jsonl"]
 
 
 @given(
@@ -83,14 +82,11 @@ def test_changed_inputs_and_lost_files_are_made_again(tmp_path):
         runner = Runner([item], Journal(tmp_path / "job.jsonl"), progress=False, whole=whole)
         return runner.run(lambda i: calls.append(i) or {})[0]["inputs"]
 
-    picture.write_text("old")
-    first = run()
-    picture.touch()
-    assert run() == first and len(calls) == 1
-    picture.write_text("another")
-    assert run() != first and len(calls) == 2
-    picture.write_text("old")
-    assert run() == first and len(calls) == 2
+    found = []
+    for content, made in (("old", 1), ("old", 1), ("another", 2), ("old", 2)):
+        picture.write_text(content)
+        found.append(run())
+        assert len(calls) == made and (found[-1] == found[0]) == (content == "old")
     run(whole=lambda item, record: False)
     assert len(calls) == 3
 
