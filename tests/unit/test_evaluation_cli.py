@@ -3,18 +3,31 @@
 import json
 import re
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import spearmanr
 
-from geodiff_plugin.evaluation import experiment
-from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS
-from geodiff_plugin.evaluation.calibrations import run_poses
+from geodiff_plugin.evaluation import calibrations, experiment, pairs, paper, strength
+from geodiff_plugin.evaluation.baselines import (
+    FAMILIES,
+    METHODS,
+    Method,
+    NotApplicable,
+    Prediction,
+    find_method,
+)
+from geodiff_plugin.evaluation.calibrations import KINDS, POINTS, RIGHT, WRONG, run_poses
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import changed_ref
-from geodiff_plugin.evaluation.options import PosesOptions
+from geodiff_plugin.evaluation.options import STRENGTHS, PosesOptions, StrengthOptions, TrustOptions
+from geodiff_plugin.evaluation.pairs import CHANGES, FLATNESS, changes_table
+from geodiff_plugin.evaluation.paper import LAYOUTS, layout_table
+from geodiff_plugin.evaluation.strength import relative_map, run_strength
 from tests.evaluating import invoke, write_scenes
 
 
@@ -72,13 +85,22 @@ def test_pairs_goes_on_after_a_broken_sample_on_request_and_tries_it_again(data,
         ("poses", "--data must be given, or --rendered above 0"),
         ("poses --rendered 1 --width 16", "--width must be between 64"),
         *((f"poses --rendered 1 --perturb {text}", "--perturb") for text in ("1.5", "1..2,0.1", "99,0")),
-        *((f"poses --rendered 1 --drift {text}", "--drift") for text in ("0.3", "a,b", "9,1", "0.3,99")),
+        ("poses --rendered 1 --drift 0.3,99", "--drift"),
+        ("trust --rendered 1 --kinds bent", "--kinds must be one of K-0.67"),
+        ("trust --rendered 1 --kinds unrelated", "without 'unrelated' where a pair is alone"),
+        ("strength --methods prior-fit@other", "--methods must be methods that use a prior"),
+        ("strength --methods sgbm", "--methods must be methods that use a prior"),
+        ("strength --strengths 7%", "--strengths"),
+        ("strength --data EMPTY", "--data must be a folder with pairs"),
+        ("table1 --data EMPTY", r"--data must be a folder with the data of table1; .* https?://"),
+        ("table2", r"--data must be given; got nothing. Booster: .*https?://"),
     ],
 )
 def test_bad_options_are_named(data, tmp_path, words, said):
     shutil.copytree(data, tmp_path / "twice" / "full")
     shutil.copytree(data, tmp_path / "twice" / "quarter")
-    folders = {"DATA": data, "TWICE": tmp_path / "twice"}
+    (tmp_path / "empty").mkdir()
+    folders = {"DATA": data, "TWICE": tmp_path / "twice", "EMPTY": tmp_path / "empty"}
     with pytest.raises(ValueError, match=said):
         invoke(*(folders.get(word, word) for word in words.split()), "-o", tmp_path / "out")
 
@@ -104,12 +126,11 @@ def test_changed_samples_differ_in_what_was_changed_only():
     assert np.array_equal(wrong.E, again.E) and np.array_equal(wrong.right, sample.right)
     assert wrong.name == "seed0000-turn1.5-shift0.1" and np.array_equal(wrong.E_scored, sample.E)
     turn = Rotation.from_matrix(wrong.E[:3, :3] @ sample.E[:3, :3].T).magnitude()
-    baseline, shift = (np.linalg.norm(E[:3, 3]) for E in (sample.E, wrong.E - sample.E))
-    assert 0.3 * 1.5 <= np.degrees(turn) <= 1.5 and 0 < shift < 0.12 * baseline
-    assert np.linalg.norm(wrong.E[:3, 3]) == pytest.approx(baseline)
+    baseline, given = (np.linalg.norm(E[:3, 3]) for E in (sample.E, wrong.E))
+    assert 0.3 * 1.5 <= np.degrees(turn) <= 1.5 and given == pytest.approx(baseline)
+    assert 0 < np.linalg.norm(wrong.E[:3, 3] - sample.E[:3, 3]) < 0.12 * baseline
     moved, turned = changed("drifted", 0.0, 2.0), changed("drifted", 0.3, 1.5)
-    down, up = (np.array_equal(moved.right[10:60], sample.right[10 - px : 60 - px]) for px in (2, -2))
-    assert down or up, "by whole pixels nothing is interpolated"
+    assert any(np.array_equal(moved.right[10:60], sample.right[10 - px : 60 - px]) for px in (2, -2))
     assert np.abs(turned.right.astype(int) - sample.right).mean() > 1
     dark = changed("right_exposure", 0.5, 1.0)
     np.testing.assert_allclose(dark.right, 0.5 * sample.right, atol=0.51)
@@ -117,11 +138,9 @@ def test_changed_samples_differ_in_what_was_changed_only():
 
 def test_the_page_of_poses(tmp_path, monkeypatch):
     """Two rendered pairs: estimated, one has no pose and the other is off by half without a word."""
-    sizes = set()
 
     def measure(ref, read, method, settings, priors, path):
         pose = method.name.partition("=")[2]
-        sizes.add(ref.files["size"])
         errors = {"given": 0.1, "refine": 0.06, "estimated": None if ref.files["seed"] > 1 else 0.5}
         error = 0.05 if "perturbed" not in ref.files and pose == "given" else errors[pose]
         warnings = [] if pose == "estimated" else ["said"]
@@ -131,16 +150,211 @@ def test_the_page_of_poses(tmp_path, monkeypatch):
 
     monkeypatch.setattr(experiment, "_measure", measure)
     page = tmp_path / "docs" / "results-pose.md"
-    options = PosesOptions(rendered=2, out=tmp_path / "out", results=page, quiet=True)
+    options = PosesOptions(rendered=2, width=256, out=tmp_path / "out", results=page, quiet=True)
     run_poses("poses", options)
-    for line in (
-        "    geodiff eval poses --rendered 2",
+    assert {
+        "    geodiff eval poses --rendered 2 --width 256",
         "| pair | true, given | perturbed, given | perturbed, refined | estimated |",
         "| mean of 2 pairs | 0.050 | 0.100 | 0.060 | 0.500 of 1 |",
         "| without a result | 0 | 0 | 0 | 1 |",
         "| off by more than 0.25, no warning | 0 | 0 | 0 | 1 |",
-    ):
-        assert line in page.read_text().splitlines()
-    run_poses("poses", replace(options, width=256, steps=2, out=tmp_path / "small"))
-    assert "geodiff eval poses --steps 2 --rendered 2 --width 256\n" in page.read_text()
-    assert sizes == {(384, 512), (192, 256)}
+    } <= set(page.read_text().splitlines())
+
+
+SMALL = "synthetic:1+4@128x96"
+
+
+@pytest.fixture(scope="module")
+def sample():
+    return load(find_pairs(SMALL)[0])
+
+
+@pytest.mark.parametrize("space", ["disparity", "depth", "log"])
+def test_a_prior_errs_as_much_as_it_says(sample, space):
+    exact = relative_map(sample, STRENGTHS["exact"], space)
+    assert exact.min() == 0.0 and exact.max() == 1.0
+    off = [np.abs(relative_map(sample, STRENGTHS[s], space) - exact).mean() for s in ("2%", "5%", "20%")]
+    assert 0 < off[0] < off[1] < off[2]
+    inner = sample.valid & (exact > 0.05) & (exact < 0.95)
+    ranks = spearmanr(exact[inner], sample.depth_m[inner]).statistic  # without an error, one orders the other
+    assert ranks == pytest.approx(-1.0 if space == "disparity" else 1.0, abs=1e-6)
+
+
+def test_the_command_writes_a_page_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    methods = ("prior-aligned", "prior-fit", "guided")
+    given = {"strengths": ("exact", "20%"), "methods": methods, "steps": 2, "resolution": 96, "quiet": True}
+    options = StrengthOptions(data=(SMALL,), out=tmp_path, **given)
+    page = run_strength("strength", options)
+    rows = {(row[0], row[1]): float(row[2]) for row in page.tables[0].rows}
+    assert len(rows) == 6 and rows["exact", "prior + oracle"] < rows["20%", "prior + oracle"]
+    assert rows["20%", "guided"] < rows["20%", "prior + oracle"]
+    monkeypatch.setattr(strength, "_measure", lambda *_: pytest.fail("every record is there"))
+    assert run_strength("strength", options).tables == page.tables
+
+
+def test_every_kind_of_wrong_calibration_changes_what_it_says(sample):
+    other = replace(sample, right=sample.right[::-1], K_right=2 * sample.K_right)
+    cases = {kind: change(sample, other) for kind, (_, change, _) in KINDS.items()}
+    expected = {"swapped": {"left", "right"}, "unrelated": {"right", "K_right"}}
+    expected |= dict.fromkeys(("mirrored", "one-picture", "shifted"), {"right"})
+    expected |= {kind: set() for kind, (_, _, factor) in KINDS.items() if factor or kind in RIGHT}
+    names = ("left", "right", "K_left", "K_right", "E")
+    for kind, case in cases.items():
+        changed = {name for name in names if not np.array_equal(getattr(case, name), getattr(sample, name))}
+        assert changed == expected.get(kind, {"K_left", "K_right"} if kind.startswith("K-") else {"E"}), kind
+    assert cases["millimetres"].E[0, 3] == pytest.approx(1000 * sample.E[0, 3])
+    assert cases["K-2"].K_left[0].tolist() == [2 * sample.K_left[0, 0], 0, sample.K_left[0, 2]]
+    np.testing.assert_allclose(cases["inverse"].E @ sample.E, np.eye(4), atol=1e-12)
+    turn = Rotation.from_matrix(np.linalg.inv(sample.E[:3, :3]) @ cases["tilted"].E[:3, :3])
+    np.testing.assert_allclose(turn.as_rotvec(degrees=True), (2, 0, 0), atol=1e-9)
+    points = calibrations._points(sample)
+    column, row = np.rint(points[0] @ sample.K_left.T / points[0, 2]).astype(int)[:2]
+    assert len(points) == POINTS and points[0, 2] == pytest.approx(sample.depth_m[row, column], rel=1e-6)
+
+
+def test_trust_counts_and_goes_on(tmp_path, monkeypatch):
+    """All but the rectified pair's K are detected; one right pair is not trusted; no prior is loaded."""
+    asked, weights = [], ["as they were"]
+    monkeypatch.setattr(calibrations.PriorCache, "get", lambda *_: None)
+    monkeypatch.setattr(calibrations.PriorCache, "fingerprint", lambda *_: weights[-1])
+
+    def measure(ref, other, kind, read, pipe, settings):
+        asked.append(kind)
+        assert (ref is other) == (kind != "unrelated")
+        rectified = not ref.files["posed"]
+        missed, distrusted = kind == "K-2" and rectified, kind in RIGHT and not rectified
+        status = "not trusted" if distrusted or (kind not in RIGHT and not missed) else "trusted"
+        off = 0.01 if kind == "right" else 0.5
+        return {"rectified": rectified, "status": status, "said": [], "off": off}
+
+    monkeypatch.setattr(calibrations, "_measure", measure)
+    options = TrustOptions(rendered=2, width=64, kinds=("swapped", "K-2"), out=tmp_path, quiet=True)
+    for _ in range(2):
+        calibrations.run_trust("trust", options)
+        assert len(asked) == 6
+    page = (tmp_path / "trust.md").read_text()
+    assert "geodiff eval trust --rendered 2 --width 64 --kinds swapped,K-2\n" in page
+    assert "3 of 4 (75 %)" in page and "1 of 2 (50 %)" in page and "2 of 2 (100 %)" in page
+    weights.append("trained further")
+    calibrations.run_trust("trust", replace(options, kinds=()))
+    assert asked[6:] == [*RIGHT, *WRONG] * 2
+
+
+def make_record(method, sample, raw, aligned, **rest):
+    def scores(abs_rel):
+        return None if abs_rel is None else dict.fromkeys(("delta1", "rmse"), 0.5) | {"abs_rel": abs_rel}
+
+    head = {"method": method, "dataset": "kitti2015", "sample": sample, "status": "ok"}
+    measured = {"capped": {"raw": scores(raw), "aligned": scores(aligned)}}
+    return head | measured | {"seconds": 2.0, "peak_bytes": 5_000_000} | rest
+
+
+def test_a_mean_needs_every_pair_and_a_method_fills_the_row_that_has_its_word(monkeypatch):
+    peer = Method("files:maps/unidepth", "UniDepth files", "", lambda *_: None, lambda _: {}, False)
+    find = paper.find_method
+    monkeypatch.setattr(paper, "find_method", lambda name: peer if name == peer.name else find(name))
+    layout, methods = LAYOUTS["table1"], ["prior-aligned", "sgbm", peer.name]
+    records = [make_record("sgbm", "0", 0.3, 0.4), make_record("prior-aligned", "0", None, 0.5)]
+    records += [make_record("sgbm", "1", None, None, status="not applicable", capped=None)]
+    records += [make_record("prior-aligned", "1", None, 0.7)]
+    records += [make_record(peer.name, label, 0.3, 0.4) for label in "01"]
+    kitti, *others = layout.columns
+    kitti = kitti._replace(dataset="kitti2015", labels=frozenset(("kitti2015/0", "kitti2015/1")))
+    table = layout_table(layout, [kitti, *others], records, methods)
+    rows = {row[:2]: row[2] for row in table.rows}
+    assert rows["Marigold", "✓"] == "0.600" and rows["UniDepth", "✗"] == "0.300"
+    assert rows[find_method("sgbm").title + "†", "✗"] == "-"
+    assert len(rows) == len(layout.rows) + 2
+    assert "hf:Intel/zoedepth-nyu-kitti" in table.note and "Not run here" in table.note
+
+
+def test_changes_are_compared_pair_by_pair():
+    errors = {"guided": 0.1, "guided:weights.matches=0": 0.3}
+    records = [make_record(m, str(i), e + 0.01 * i, 1.0) for m, e in errors.items() for i in range(5)]
+    rows = {row[0]: row for row in changes_table(records, "guided").rows}
+    assert set(rows) == {"as it is", "without matches"}
+    assert rows["as it is"][5] == "-" and rows["without matches"][5] == "+0.200 [+0.200, +0.200]"
+    assert rows["without matches"][3] == "0.340"  # the worst pair
+
+
+def test_cost_is_told_as_multiples_of_the_plain_pipeline():
+    records = [make_record("prior-aligned", str(i), None, 0.1, seconds=s) for i, s in enumerate((9, 1, 2))]
+    records += [make_record("guided", str(i), 0.1, 0.1, seconds=6.0, peak_bytes=20_000_000) for i in range(3)]
+    table = pairs.cost_table(records)
+    assert table.title == "Cost on 3 pairs"
+    assert table.rows[0] == ("plain pipeline", "3", "2.00", "1.00", "5", "1.00")
+    assert table.rows[1][2:] == ("6.00", "3.00", "20", "4.00")
+    with pytest.raises(ValueError, match="the pairs must be some on which prior-aligned works"):
+        pairs.cost_table([records[0] | {"status": "broken"}])
+
+
+@pytest.fixture
+def free_methods(monkeypatch):
+    """Every method that a table asks for, as one that costs nothing: twice the truth, or a reason why not."""
+
+    def measure(name, sample, settings, priors):
+        if name == "sgbm":
+            raise NotApplicable("not rectified")
+        twice = 2.0 * np.where(sample.valid, sample.depth_m, 1.0)
+        twice[0, 0] += 0.1
+        return Prediction(None, relative=twice) if name == "prior-aligned" else Prediction(twice)
+
+    names = {name for own in LAYOUTS for name in paper.methods_of(own, ())} | {*pairs.COST_METHODS}
+    names |= {*FLATNESS, *(method for _, method in CHANGES["parts"])}
+    free = {n: Method(n, n, n, partial(measure, n), lambda s: {"steps": s.steps}, False) for n in names}
+    monkeypatch.setattr("geodiff_plugin.evaluation.baselines.METHODS", free)
+
+
+@pytest.fixture
+def scene(data):
+    return data / "one"
+
+
+def test_table1_runs_what_is_there_and_tells_how_to_obtain_the_rest(
+    free_methods, scene, tmp_path, monkeypatch
+):
+    out, layout = tmp_path / "out", LAYOUTS["table1"]
+    said = invoke("table1", "--data", scene, "-o", out)
+    tables = json.loads((out / "table1.json").read_text())["tables"]
+    latex = (out / "table1.tex").read_text()
+    assert r"\multicolumn{3}{c}{Booster (not found)}" in latex and r"AbsRel $\downarrow$ &" in latex
+    assert all(cell in said for table in tables for row in table["rows"] for cell in row)
+    assert "Middlebury (middlebury2014, 1 pair): AbsRel ↓" in said and "as published" not in said
+    assert "KITTI-Stereo was not found. To obtain it: data_scene_flow.zip" in said
+    rows = {(row[0], row[1]): row for row in tables[0]["rows"]}
+    assert float(rows["GeoDiff†, Algorithm 1 as printed", "✗"][-3]) == pytest.approx(1.0, abs=2e-3)
+    assert float(rows["Marigold", "✓"][-3]) < 0.01
+    lines = (out / "samples.jsonl").read_text()
+    small = tuple(column._replace(datasets=column.datasets[::-1], full_count=1) for column in layout.columns)
+    monkeypatch.setitem(LAYOUTS, "table1", layout._replace(columns=small))
+    again = invoke("table1", "--data", scene, "-o", out)  # a full set now
+    assert "Middlebury, as published: RMSE m ↓" in again and re.search(r" 2\.31\s", again)
+    assert (out / "samples.jsonl").read_text() == lines  # everything was there
+
+
+def test_ablation_parts_and_flatness_take_any_data(free_methods, scene, tmp_path):
+    words = ("--data", scene, "-o", tmp_path / "out", "--methods", "sweep-sgm")
+    ablation, parts, flat = (invoke(name, *words) for name in ("ablation", "parts", "flatness"))
+    assert re.search("Learning scale and shift only +✗ +1.000 ", ablation)
+    for said, presets in ((ablation, ("guided", "paper")), (parts, ("parts",))):
+        titles = [title for preset in presets for title, _ in CHANGES[preset]]
+        assert all(re.search(f"{re.escape(title)} +1 ", said) for title in titles)
+    for said in (parts, flat):
+        further = said.partition("Further methods and priors, 1 pair")[2]
+        assert re.search("sweep-sgm +1 +1.000", further) and not re.search("guided +1 ", further)
+    assert re.search("`smoothness` +40 ", flat) and (tmp_path / "out" / "flatness.md").is_file()
+
+
+def test_cost_measures_each_method_in_a_process_of_its_own(free_methods, scene, tmp_path, monkeypatch):
+    started = []
+
+    def inline(max_workers, mp_context):
+        started.append((max_workers, mp_context.get_start_method()))
+        return ThreadPoolExecutor(1)
+
+    monkeypatch.setattr(pairs, "ProcessPoolExecutor", inline)
+    out = tmp_path / "out"
+    answer = invoke("cost", "--data", scene, "-o", out, "--save-depth")
+    assert started == [(1, "spawn")] * len(pairs.COST_METHODS) and re.search("plain pipeline +1 ", answer)
+    assert "Denoising steps of each: 4 with bundled." in answer and (out / "cost.md").is_file()
+    assert (out / "cost" / "depth" / "guided" / "middlebury2014_one.npy").is_file()

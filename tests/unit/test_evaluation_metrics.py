@@ -40,41 +40,36 @@ def maps(seed, size=(7, 11)):
 @given(seed=st.integers(0, 200), cap=st.sampled_from([None, 20.0, 80.0]))
 def test_depth_metrics_pixel_by_pixel(seed, cap):
     pred, truth, valid = maps(seed)
-    valid[0, 0] = True
-    known = [
-        (p, t)
-        for p, t, v in zip(pred.flat, truth.flat, valid.flat, strict=True)
-        if v and (not cap or t < cap)
-    ]
+    valid[0, 0], pred[0, 0] = True, 1.0
+    triples = zip(pred.flat, truth.flat, valid.flat, strict=True)
+    known = [(p, t) for p, t, v in triples if v and (not cap or t < cap)]
     pairs = [(min(p, cap or p), t) for p, t in known if math.isfinite(p) and p > 0]
-    scores = evaluate_depth(pred, truth, valid, cap)
-    assert scores["pixels"] == len(known) and scores["coverage"] == pytest.approx(len(pairs) / len(known))
-    n = len(pairs)
-    if not n:
-        assert math.isnan(scores["abs_rel"]) and math.isnan(scores["silog"])
-        return
-    assert scores["abs_rel"] == pytest.approx(sum(abs(p - t) / t for p, t in pairs) / n)
-    assert scores["rmse"] == pytest.approx(math.sqrt(sum((p - t) ** 2 for p, t in pairs) / n))
-    log_squares = sum(math.log(p / t) ** 2 for p, t in pairs)
-    assert scores["log_rmse"] == pytest.approx(math.sqrt(log_squares / n))
-    logs = [math.log(p) - math.log(t) for p, t in pairs]
-    assert scores["silog"] == pytest.approx(100 * math.sqrt(log_squares / n - (sum(logs) / n) ** 2), abs=1e-4)
+    n, logs = len(pairs), [math.log(p) - math.log(t) for p, t in pairs]
+    squares = sum(log**2 for log in logs) / n
+    expected = {"pixels": len(known), "coverage": n / len(known)}
+    expected["abs_rel"] = sum(abs(p - t) / t for p, t in pairs) / n
+    expected["rmse"] = math.sqrt(sum((p - t) ** 2 for p, t in pairs) / n)
+    expected["log_rmse"] = math.sqrt(squares)
+    expected["silog"] = 100 * math.sqrt(max(squares - (sum(logs) / n) ** 2, 0.0))
     for k in (1, 2, 3):
-        assert scores[f"delta{k}"] == pytest.approx(sum(max(p / t, t / p) < 1.25**k for p, t in pairs) / n)
+        expected[f"delta{k}"] = sum(max(p / t, t / p) < 1.25**k for p, t in pairs) / n
+    assert evaluate_depth(pred, truth, valid, cap) == pytest.approx(expected, abs=1e-4)
 
 
-@pytest.mark.parametrize("step_px", [0.0, 1.0, 1.5, 4.0])
+def test_a_map_of_holes_has_no_errors_but_a_coverage():
+    scores = evaluate_depth(np.full((2, 2), NAN), np.ones((2, 2)), np.ones((2, 2), bool))
+    assert scores["coverage"] == 0 and math.isnan(scores["abs_rel"])
+
+
+@pytest.mark.parametrize("step_px", [0.0, 1.5, 4.0])
 def test_disparity_metrics_pixel_by_pixel(step_px):
     truth, pred = np.array([[100.0, 10.0, 50.0, 5.0, 9.0]]), np.array([[104.0, 13.5, 50.5, np.inf, 9.0]])
     valid = np.array([[True, True, True, True, False]])
-    scores = evaluate_disparity(pred, truth, valid, step_px)
-    errors = [4.0, 3.5, 0.5]
-    assert scores["epe"] == pytest.approx(sum(errors) / 3)
-    for k in (1, 2, 3):
-        assert scores[f"bad{k}"] == (None if step_px > k else pytest.approx(sum(e > k for e in errors) / 3))
-    assert scores["d1"] == (None if step_px > 3 else pytest.approx(1 / 3))  # 4 px of 100 are no 5 %
-    holes = evaluate_disparity(np.full((1, 5), NAN), truth, valid, step_px)
-    assert math.isnan(holes["epe"])
+    expected = {"epe": 8 / 3, "bad1": 2 / 3, "bad2": 2 / 3, "bad3": 2 / 3, "d1": 1 / 3}  # 4 of 100 are no 5 %
+    coarse = {name for name, least in (("bad1", 1), ("bad2", 2), ("bad3", 3), ("d1", 3)) if step_px > least}
+    expected |= dict.fromkeys(coarse)
+    assert evaluate_disparity(pred, truth, valid, step_px) == pytest.approx(expected)
+    assert math.isnan(evaluate_disparity(np.full((1, 5), NAN), truth, valid, step_px)["epe"])
 
 
 @given(seed=st.integers(0, 200), steps=st.integers(1, 30))
@@ -82,23 +77,19 @@ def test_ause_pixel_by_pixel(seed, steps):
     pred, truth, valid = maps(seed)
     valid[1, 1] = True
     sigma = np.random.default_rng(seed).permutation(truth.size).reshape(truth.shape).astype(float)
-    kept = [
-        (abs(p - t) / t, s)
-        for p, t, s, v in zip(pred.flat, truth.flat, sigma.flat, valid.flat, strict=True)
-        if v and math.isfinite(p) and p > 0
-    ]
+    pixels = zip(pred.flat, truth.flat, sigma.flat, valid.flat, strict=True)
+    kept = [(abs(p - t) / t, s) for p, t, s, v in pixels if v and math.isfinite(p) and p > 0]
 
     def curve(key):
         ordered = [error for error, _ in sorted(kept, key=key, reverse=True)]
         left = [ordered[k * len(ordered) // steps :] for k in range(steps)]
-        return [sum(rest) / len(rest) for rest in left]
+        return np.array([sum(rest) / len(rest) for rest in left])
 
     best, mean = curve(lambda e: e[0]), sum(e for e, _ in kept) / len(kept)
-    expected = np.mean(np.subtract(curve(lambda e: e[1]), best))
-    assert ause(pred, truth, valid, sigma, steps) == pytest.approx(expected, abs=1e-9)
-    assert ause(pred, truth, valid, 7 * sigma, steps) == pytest.approx(expected, abs=1e-9)
-    assert ause(pred, truth, valid, np.abs(pred / truth - 1), steps) == pytest.approx(0, abs=1e-9)
-    assert ause(pred, truth, valid, None, steps) == pytest.approx(mean - np.mean(best), abs=1e-9)
+    expected = np.mean(curve(lambda e: e[1]) - best)
+    orders = ((sigma, expected), (7 * sigma, expected), (None, mean - best.mean()))
+    for uncertainty, area in orders:
+        assert ause(pred, truth, valid, uncertainty, steps) == pytest.approx(area, abs=1e-9)
 
 
 def test_confidence_deciles_closed_form():
@@ -205,13 +196,10 @@ def test_boundary_errors_are_distances_of_parallel_edges(moved):
 
 
 def test_errors_at_edges_and_of_surfaces():
-    truth = np.full((40, 60), 2.0)
-    truth[:, 30:] = 4.0
+    truth, shifted = (np.where(np.arange(60)[None] < c, 2.0, 4.0).repeat(40, 0) for c in (30, 32))
     valid = np.ones(truth.shape, bool)
     assert edge_error(truth, truth, valid) == surface_error(truth, truth, valid) == 0.0
-    shifted = np.full((40, 60), 2.0)
-    shifted[:, 32:] = 4.0
     assert edge_error(shifted, truth, valid) > 0.1 and surface_error(shifted, truth, valid) == 0.0
     rough = truth * np.exp(0.01 * np.random.default_rng(0).normal(size=truth.shape))
     assert surface_error(rough, truth, valid) > 5.0
-    assert np.isnan(edge_error(np.ones((9, 9)), np.full((9, 9), 2.0), np.ones((9, 9), bool)))
+    assert np.isnan(edge_error(truth, np.full(truth.shape, 2.0), valid))

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 from geodiff_plugin.cli.eval import eval_app
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.figures import sweep_g_s
-from geodiff_plugin.evaluation.options import FIGURES
 from geodiff_plugin.formats import write_depth_npy
 from geodiff_plugin.plotting import colour_depth, depth_figure, depth_range, grid, ticks
+from tests.evaluating import write_scenes
 
 
 def test_near_is_yellow_far_is_blue_unknown_is_grey():
@@ -35,7 +35,6 @@ RISING = np.linspace(2.0, 3.0, 100).reshape(10, 10)
     [
         (np.full((4, 4), 2.0), {}),
         (np.full((4, 4), np.nan), {}),
-        (np.zeros((4, 4)), {}),
         (RISING, {"near": 10.0}),
         (RISING, {"far": 0.5}),
     ],
@@ -49,11 +48,9 @@ def test_flat_and_empty_maps_and_ends_beyond_the_data_have_a_range(depth, ends):
 @pytest.mark.parametrize(
     ("call", "match"),
     [
-        (lambda: depth_range(np.ones((3, 4)), near=0), "near"),
         (lambda: depth_range(np.ones((3, 4)), far=float("inf")), "far"),
         (lambda: depth_range(np.ones((3, 4)), near=3, far=2), "near < far"),
         (lambda: colour_depth(np.ones((2, 3, 4))), "depth_m"),
-        (lambda: grid([], []), "one or more, each with a title; got 0"),
         (lambda: grid([np.zeros((2, 2))], ["a", "b"]), "each with a title; got 1, 2 titles"),
         (lambda: grid([np.zeros((2, 2, 4))], ["a"]), "images"),
     ],
@@ -63,8 +60,8 @@ def test_what_is_no_picture_or_range_is_named(call, match):
         call()
 
 
-@pytest.mark.parametrize("near", [0.001, 0.3, 2.0, 47.0])
-@pytest.mark.parametrize("ratio", [1.001, 1.1, 1.9, 5.0, 30.0, 1e4])
+@pytest.mark.parametrize("near", [0.001, 2.0, 47.0])
+@pytest.mark.parametrize("ratio", [1.001, 1.9, 5.0, 30.0, 1e4])
 def test_ticks_are_few_rising_inside_and_round(near, ratio):
     values = ticks(near, near * ratio)
     assert 2 <= len(values) <= 8
@@ -82,13 +79,11 @@ def test_a_figure_is_the_map_beside_its_legend():
     column = legend[:, 12].astype(int)
     inside = np.flatnonzero((column.max(axis=1) - column.min(axis=1)) > 60)
     assert column[inside[1], 2] > column[inside[1], 0] and column[inside[-2], 0] > column[inside[-2], 2]
-    assert (legend == 0).all(axis=-1).sum() > 100
-    assert not (pixels == 128).all(axis=-1).any()
+    assert (legend == 0).all(axis=-1).sum() > 100 and not (pixels == 128).all(axis=-1).any()
     depth[:50, :50] = np.nan
     assert (np.asarray(depth_figure(depth))[:, 300:] == 128).all(axis=-1).any()
     small = np.array([[1.0, 2.0], [3.0, 4.0]])  # is enlarged by a whole factor
     figure = np.asarray(depth_figure(small, near=1, far=4))
-    assert figure.shape[0] == 256
     np.testing.assert_array_equal(figure[::128, :256:128], colour_depth(small, near=1, far=4))
 
 
@@ -96,35 +91,25 @@ def test_grid_places_cells_and_titles():
     red = np.zeros((20, 40, 3), dtype=np.uint8)
     red[..., 0] = 255
     pictures = [red, np.zeros((40, 40)), np.ones((20, 40), bool), Image.new("L", (10, 5), 77), red / 255.0]
-    titles = ["a", "b", "c", "d", "a title much too long for its cell" * 3]
-    sheet = grid(pictures, titles, columns=2, cell_width=80)
+    sheet = grid(pictures, ["a", "b", "c", "d", "too long for its cell" * 3], columns=2, cell_width=80)
     pixels = np.asarray(sheet)
     assert sheet.size == (6 + 2 * 86, 6 + (80 + 40 + 40) + 3 * (24 + 6))
-    assert tuple(pixels[6 + 24 + 5, 6 + 40]) == (255, 0, 0)
-    assert (pixels == 77).all(axis=-1).any()
+    assert tuple(pixels[35, 46]) == (255, 0, 0) and (pixels == 77).all(axis=-1).any()
 
 
 @pytest.fixture
-def pair_folder(tmp_path, textured_plane):
-    """The rendered plane as a folder of our own layout."""
-    folder = tmp_path / "data" / "plane"
-    folder.mkdir(parents=True)
-    for side in ("left", "right"):
-        Image.fromarray(getattr(textured_plane, side)).save(folder / f"{side}.png")
-    write_depth_npy(folder / "depth.npy", textured_plane.depth_m)
-    rows = " ".join(map(str, textured_plane.K.ravel()))
-    (folder / "calib.txt").write_text(f"{rows}\n{textured_plane.E[0, 3]}\n")
-    return tmp_path / "data"
+def scenes(tmp_path):
+    return write_scenes(tmp_path / "data", "wall")
 
 
 @pytest.fixture
-def draw(pair_folder, make_pipeline, tmp_path):
+def draw(scenes, make_pipeline, tmp_path):
     """``draw(name, *words)`` -> picture and numbers."""
     make_pipeline().save_pretrained(tmp_path / "prior")
 
     def run(name, *words):
         out = tmp_path / "out"
-        options = ("--data", pair_folder, "--prior", tmp_path / "prior", "--resolution", 64, "-o", out)
+        options = ("--data", scenes, "--prior", tmp_path / "prior", "--resolution", 64, "-o", out)
         given = [str(word) for word in ("figure", name, "--steps", 1, *options, *words)]
         answer = CliRunner().invoke(eval_app, given, catch_exceptions=False)
         assert answer.exit_code == 0 and answer.stdout == f"{out / f'figure-{name}.png'}\n"
@@ -133,54 +118,42 @@ def draw(pair_folder, make_pipeline, tmp_path):
             picture = np.asarray(image.convert("RGB"))
         assert picture.shape[0] > 100 and picture.std() > 5
         numbers = json.loads((out / f"figure-{name}.json").read_text())
-        assert "eval figure" in numbers["command"] and f"--data {pair_folder}" in numbers["command"]
+        assert "eval figure" in numbers["command"] and f"--data {scenes}" in numbers["command"]
         return picture, numbers
 
     return run
 
 
-#: Figure -> options, and what its numbers owe; the unchanged pair is in both panels of ``exposure``.
-CASES = {
-    "gs-sweep": (
-        ["--max", 20],
-        lambda n: n["g_s_m"][::79] == [1, 20] and len(n["loss"]) == len(n["abs_rel"]),
-    ),
-    "inner-steps": (
-        ["--updates", "2,1"],
-        lambda n: n["updates"] == [1, 2] and len(n["paper"]["seconds"]) == 2,
-    ),
-    "exposure": (
-        ["--methods", "sweep-sgm,sgbm"],
-        lambda n: n["gain"]["sgbm"][2] == n["gamma"]["sgbm"][2] > 0,
-    ),
-    "ablation": (["--methods", "prior-aligned,sgbm"], lambda n: len(n["abs_rel"]["folder/plane"]) == 2),
-}
-
-
-@pytest.mark.parametrize("name", [name for name in FIGURES if name != "qualitative"])
-def test_a_figure_has_its_numbers_beside_it(draw, name):
-    words, is_right = CASES[name]
+@pytest.mark.parametrize(
+    ("name", "words", "is_right"),
+    [
+        ("gs-sweep", ["--max", 20], lambda n: n["g_s_m"][::79] == [1, 20] and len(n["loss"]) == 80),
+        ("inner-steps", ["--updates", "2,1"], lambda n: n["updates"] == [1, 2] and n["paper"]["seconds"][1]),
+        # The unchanged pair is in both panels.
+        ("exposure", ["--methods", "sgbm"], lambda n: n["gain"]["sgbm"][2] == n["gamma"]["sgbm"][2] > 0),
+        ("ablation", ["--methods", "prior-aligned,sgbm"], lambda n: len(*n["abs_rel"].values()) == 2),
+    ],
+)
+def test_a_figure_has_its_numbers_beside_it(draw, name, words, is_right):
     assert is_right(draw(name, *words)[1])
 
 
-def test_qualitative_has_clouds_reasons_and_perturbed_poses(draw, pair_folder, tmp_path):
-    words = ("--methods", "sgbm,sweep-sgm")
+def test_qualitative_has_clouds_reasons_and_perturbed_poses(draw, scenes, tmp_path):
+    words = ("--methods", "sgbm")
     without, _ = draw("qualitative", *words)
     with_clouds, numbers = draw("qualitative", *words, "--clouds")
     assert with_clouds.shape[0] > without.shape[0] and "--clouds" in numbers["command"]
     maps = tmp_path / "maps"
     maps.mkdir()
-    write_depth_npy(maps / "folder_plane-turn3-shift0.1.npy", np.zeros((96, 128), np.float32))
-    with Image.open(pair_folder / "plane" / "right.png") as right:
-        right.crop((0, 0, 120, 96)).save(pair_folder / "plane" / "right.png")
-    _, numbers = draw("qualitative", "--methods", f"files:{maps},sgbm", "--perturb", "3,0.1")
-    # An empty map, and views of different sizes.
-    assert numbers["abs_rel"] == {"folder/plane-turn3-shift0.1": {f"files:{maps}": None, "sgbm": None}}
+    write_depth_npy(maps / "middlebury2014_wall-turn3-shift0.1.npy", np.zeros((48, 144), np.float32))
+    methods = [f"files:{maps}", f"files:{scenes}"]  # an empty map, and none
+    _, numbers = draw("qualitative", "--methods", ",".join(methods), "--perturb", "3,0.1")
+    assert numbers["abs_rel"] == {"middlebury2014/wall-turn3-shift0.1": dict.fromkeys(methods)}
 
 
-def test_the_sweep_of_a_true_map_is_best_at_the_true_scale(textured_plane, pair_folder):
-    sample = load(find_pairs(pair_folder)[0])
-    sweep, rendered = sweep_g_s(sample, textured_plane.depth_m / 2.5, "depth", 10.0)
+def test_the_sweep_of_a_true_map_is_best_at_the_true_scale(scenes):
+    sample = load(find_pairs(scenes)[0])
+    sweep, rendered = sweep_g_s(sample, sample.depth_m / 2.5, "depth", 10.0)
     g_s, loss, abs_rel = (sweep[name] for name in ("g_s_m", "loss", "abs_rel"))
     step = g_s[1] / g_s[0]
     assert 1 / step < g_s[abs_rel.argmin()] / 2.5 < step

@@ -106,18 +106,15 @@ def test_its_scale_is_that_of_the_frame_before(pipe, textured_plane, first):
     ratio = call(pipe, textured_plane, first).prediction / first.prediction
     assert abs(np.log(np.median(ratio))) < 0.05
     plain = planned(pipe, guided(textured_plane, first), latents=torch.zeros_like(first.latent))
-    near_m = first.global_scale[0] * first.shift[0]
-    torch.testing.assert_close(plain.near_m, near_m, rtol=1e-5, atol=0)
-    torch.testing.assert_close(
-        plain.far_m, near_m + first.global_scale[0] * first.scale[0], rtol=1e-5, atol=0
-    )
+    g_s, shift = first.global_scale[0], first.shift[0]
+    torch.testing.assert_close(plain.near_m, g_s * shift, rtol=1e-5, atol=0)
+    torch.testing.assert_close(plain.far_m, g_s * shift + g_s * first.scale[0], rtol=1e-5, atol=0)
     # Poses without a unit, a frame before whose lengths were multiplied to a metric prior's.
     first.rescaled, first.global_scale = 4.0, 4.0 * first.global_scale
-    in_metres = planned(pipe, guided(textured_plane, first))
-    in_baselines = planned(pipe, guided(textured_plane, first, unit=None))
-    torch.testing.assert_close(in_metres.near_m, 4.0 * plain.near_m)
-    torch.testing.assert_close(in_baselines.near_m, plain.near_m)
-    torch.testing.assert_close(in_baselines.far_m, plain.far_m)
+    for unit, factor in (("m", 4.0), (None, 1.0)):
+        again = planned(pipe, guided(textured_plane, first, unit=unit))
+        torch.testing.assert_close(again.near_m, factor * plain.near_m)
+        torch.testing.assert_close(again.far_m, factor * plain.far_m)
 
 
 def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane, first):
@@ -126,21 +123,14 @@ def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane, first):
         vars(other).update(entries)
         return other
 
-    two, pair = "output of 1 image of 2 members; got one of 1 image of 1 member", textured_plane
     for previous, told, said in (
         (first.prediction, {}, "previous must be a MetricDepthOutput"),
         (MetricDepthOutput(first.prediction), {}, "output_latent=True"),
-        (first, {"ensemble_size": 2}, two),
+        (first, {"ensemble_size": 2}, "of 1 image of 2 members; got one of 1 image of 1 member"),
         (changed(space="disparity"), {}, "a prior whose map is affine in depth; got one in disparity"),
         (changed(latent=first.latent[..., :-1]), {}, "a sequence of its own"),
-        (first, {"latents": first.latent[..., :-1]}, "latents must be of shape"),
         (first, {"latents": first.latent[:, :1]}, "latents must be of shape"),  # would be spread silently
         (first, {"latents": [first.latent]}, "latents must be None or a torch.Tensor; got list"),
     ):
         with pytest.raises((InputError, InputTypeError), match=said):
-            call(pipe, pair, previous, **told)
-    twice = {name: getattr(first, name).repeat(1, 2) for name in ("scale", "shift", "global_scale")}
-    members = changed(latent=first.latent.repeat(2, 1, 1, 1), **twice)
-    guidance = GeometryGuidance([pair.right] * 2, pair.K, pair.E, previous=members)
-    with pytest.raises(InputError, match="previous must be the output of 2 images of 1 member"):
-        pipe([pair.left] * 2, guidance=guidance)
+            call(pipe, textured_plane, previous, **told)
