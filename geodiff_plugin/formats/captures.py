@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -54,14 +54,14 @@ class CaptureFrame:
 
     name: str
     image: Path
-    K: np.ndarray
-    size: tuple[int, int]
     E: np.ndarray | None = None
-    lens: Distortion | None = None
     depth: Path | None = None
     depth_per_m: float = 1000.0
     index: int | None = None
     points: np.ndarray | None = None
+    size: tuple[int, int] = (0, 0)
+    K: np.ndarray = field(default_factory=lambda: np.eye(3))
+    lens: Distortion | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +74,8 @@ class CaptureFiles:
     notes: tuple[str, ...] = ()
 
 
-#: What was typed: K for images of a size, and the file of a video's trajectory.
-Typed = tuple[Callable[[tuple[int, int]], np.ndarray | None], str | os.PathLike[str] | None]
+#: What a layout's reader finds: its kind, its unit, and the frames, each with its camera as the file has it.
+Found = tuple[str, str | None, list[tuple[CaptureFrame, Camera | None]]]
 
 
 def read_capture(
@@ -93,21 +93,17 @@ def read_capture(
     source = Path(path)
     if not source.exists():
         bad_value("PATH", "a capture", f"{source}, which does not exist", error=MissingFileError)
-
-    def typed_K(size: tuple[int, int]) -> np.ndarray | None:
-        if K is None and fov is not None:
-            return intrinsics_from_fov(fov, size)
-        return None if K is None else np.asarray(K, dtype=np.float64)
-
-    typed = (typed_K, trajectory)
     with reading_whole(source, "capture"):
-        files = next((files for read in LAYOUTS if (files := read(source, typed)) is not None), None)
-    if files is None:
-        expected = "a COLMAP model, a transforms.json, 7-Scenes, ScanNet or TUM RGB-D, a video or images"
-        bad_value("PATH", expected, f"{source}, which is none of these")
-    tracked = any(frame.E is not None for frame in files.frames)
-    frames = [frame for frame in files.frames if frame.image.is_file()]
-    skipped = {"no image file": [frame.name for frame in files.frames if frame not in frames]}
+        read = (layout(source, None if trajectory is None else Path(trajectory)) for layout in LAYOUTS)
+        found = next((each for each in read if each is not None), None)
+        if found is None:
+            expected = "a COLMAP model, a transforms.json, 7-Scenes, ScanNet or TUM RGB-D, a video or images"
+            bad_value("PATH", expected, f"{source}, which is none of these")
+        kind, unit, pairs = found
+        whole = [(frame, camera) for frame, camera in pairs if frame.image.is_file()]
+        frames = [_finished(frame, camera, K, fov) for frame, camera in whole]
+    tracked = any(frame.E is not None for frame in frames)
+    skipped = {"no image file": [frame.name for frame, _ in pairs if not frame.image.is_file()]}
     if tracked:
         skipped["no pose"] = [frame.name for frame in frames if frame.E is None]
         frames = [frame for frame in frames if frame.E is not None]
@@ -121,32 +117,33 @@ def read_capture(
     if len(frames) < 2:
         cure = "One frame has no second view: use geodiff depth with known points, or record more."
         bad_value("a capture", "at least two frames", f"{len(frames)} in {source}", cure)
-    return CaptureFiles(tuple(frames), files.kind, files.unit if tracked else None, notes)
+    return CaptureFiles(tuple(frames), kind, unit if tracked else None, notes)
 
 
-def _framed(
-    path: Path, camera: Camera, E: np.ndarray | None, typed: Typed, depth: Path | None = None
+def _finished(
+    frame: CaptureFrame, camera: Camera | None, K: np.ndarray | None, fov: float | None
 ) -> CaptureFrame:
-    """A frame of an image file, its camera scaled to the image's size."""
-    if not path.is_file():
-        return CaptureFrame(path.stem, path, camera.K, (0, 0), E)
-    size = upright_size(path, f"{path}")
-    K = typed[0](size)
-    if K is None:
-        K = resized(camera, size, f"{path}", "Is it a crop? Give --K.").K
-    depth = depth if depth is not None and depth.is_file() else None
-    return CaptureFrame(path.stem, path, K, size, E, lens_of(camera, f"{path}"), depth)
+    """The frame with its size and K: as typed, else the file's camera scaled to the image, else by EXIF."""
+    name = str(frame.image)
+    size = upright_size(frame.image, name) if frame.index is None else frame.size
+    if K is None and fov is not None:
+        K = intrinsics_from_fov(fov, size)
+    elif K is None and camera is not None:
+        K = resized(camera, size, name, "Is it a crop? Give --K.").K
+    elif K is None and frame.index is not None:
+        bad_value("K", "given by --K or --fov", "none", "A video does not say its focal length.")
+    elif K is None:
+        K = intrinsics_from_exif(frame.image, frame.image.name)[0]
+    lens = None if camera is None else lens_of(camera, name)
+    depth = frame.depth if frame.depth is not None and frame.depth.is_file() else None
+    return replace(frame, size=size, K=np.asarray(K, dtype=np.float64), lens=lens, depth=depth)
 
 
-def _file_camera(folder: Path, published: Camera | None) -> Camera:
+def _file_camera(folder: Path, published: Camera | None) -> Camera | None:
     """The intrinsics that a data set has as a file, else its published ones."""
     files = [parent / name for parent in (folder, folder.parent) for name in INTRINSICS]
     file = next((file for file in files if file.is_file()), None)
-    if file is not None:
-        return Camera(read_matrix(file, f"{file}")[:3, :3])
-    if published is None:
-        bad_value("K", "given by --K, --fov or a file", f"none of {', '.join(INTRINSICS)} in {folder}")
-    return published
+    return published if file is None else Camera(read_matrix(file, f"{file}")[:3, :3])
 
 
 def _images_of(paths: Iterable[Path]) -> list[Path]:
@@ -157,23 +154,22 @@ def _images_of(paths: Iterable[Path]) -> list[Path]:
 # A layout's reader returns None for what is none.
 
 
-def _transforms(path: Path, typed: Typed) -> CaptureFiles | None:
+def _transforms(path: Path, _: Path | None) -> Found | None:
     file = path / "transforms.json" if path.is_dir() else path
     if file.suffix != ".json" or not file.is_file():
         return None
-    frames: list[CaptureFrame] = []
-    unit: str | None = "m"
+    pairs, solved = [], False
     for name, entries in nerf_frames(read_text(file, "PATH")).items():
         paths = [file.parent / f"{name}{suffix}" for suffix in ("", *IMAGES)]  # synthetic scenes leave it out
         image = next((path for path in paths if path.is_file()), paths[0])
         camera = nerf_camera(entries, upright_size(image, f"{image}") if image.is_file() else None)
         depth = file.parent / entries.get("depth_file_path", f"depth/{image.stem}.png")
-        frames.append(_framed(image, camera, nerf_pose(entries), typed, depth))
-        unit = None if any(key in entries for key in OF_COLMAP) else unit
-    return CaptureFiles(tuple(frames), "transforms.json", unit)
+        pairs.append((CaptureFrame(image.stem, image, nerf_pose(entries), depth), camera))
+        solved |= any(key in entries for key in OF_COLMAP)
+    return "transforms.json", None if solved else "m", pairs
 
 
-def _colmap(path: Path, typed: Typed) -> CaptureFiles | None:
+def _colmap(path: Path, _: Path | None) -> Found | None:
     folders = (path, path / "sparse" / "0", path / "sparse", path / "colmap" / "sparse" / "0")
     files = next(filter(None, map(model_files, folders)), None)
     if files is None:
@@ -184,15 +180,15 @@ def _colmap(path: Path, typed: Typed) -> CaptureFiles | None:
     except MissingFileError:
         seen = {}
     parents = [folder / "images", *(parent / "images" for parent in list(folder.parents)[:3]), folder]
-    frames = []
+    pairs = []
     for name, (number, T, camera) in sorted(images.items()):
         image = next((parent / name for parent in parents if (parent / name).is_file()), parents[0] / name)
-        frame = _framed(image, cameras[camera], np.linalg.inv(T), typed)
-        frames.append(replace(frame, points=seen.get(number)))
-    return CaptureFiles(tuple(frames), "COLMAP model", None)
+        frame = CaptureFrame(image.stem, image, np.linalg.inv(T), points=seen.get(number))
+        pairs.append((frame, cameras[camera]))
+    return "COLMAP model", None, pairs
 
 
-def _tracked(folder: Path, typed: Typed) -> CaptureFiles | None:
+def _tracked(folder: Path, _: Path | None) -> Found | None:
     for kind, (images, pose, depth, published) in TRACKED.items():
         paths = _images_of(folder.glob(images))
         if not (paths and (folder / pose).parent.is_dir()):
@@ -204,24 +200,21 @@ def _tracked(folder: Path, typed: Typed) -> CaptureFiles | None:
             with suppress(InputError):  # there is none, or the tracker was lost (infinity, NaN)
                 E = read_matrix(file, f"{file}")
             E = None if E is None else rigid(E, f"the pose in {file}")
-            frames.append(replace(_framed(path, camera, E, typed, folder / depth.format(name)), name=name))
-        return CaptureFiles(tuple(frames), kind)
+            frames.append(CaptureFrame(name, path, E, folder / depth.format(name)))
+        return kind, "m", [(frame, camera) for frame in frames]
     return None
 
 
-def _tum(folder: Path, typed: Typed) -> CaptureFiles | None:
+def _tum(folder: Path, _: Path | None) -> Found | None:
     if not ((folder / "rgb.txt").is_file() and (folder / "groundtruth.txt").is_file()):
         return None
-    camera = _file_camera(folder, TUM_RGBD)
-    pose_at = _trajectory(folder / "groundtruth.txt")
+    camera, pose_at, pairs = _file_camera(folder, TUM_RGBD), _trajectory(folder / "groundtruth.txt"), []
     depths = _timed_names(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
-    frames = []
     for t, name in _timed_names(folder / "rgb.txt"):
         near, depth_name = min(depths, key=lambda depth: abs(depth[0] - t), default=(np.inf, ""))
         depth = folder / depth_name if abs(near - t) < FARTHEST_S else None
-        frame = _framed(folder / name, camera, pose_at(t), typed, depth)
-        frames.append(replace(frame, depth_per_m=TUM_DEPTH))
-    return CaptureFiles(tuple(frames), "TUM RGB-D")
+        pairs.append((CaptureFrame(Path(name).stem, folder / name, pose_at(t), depth, TUM_DEPTH), camera))
+    return "TUM RGB-D", "m", pairs
 
 
 def _timed_names(file: Path) -> list[tuple[float, str]]:
@@ -248,27 +241,19 @@ def _trajectory(file: Path) -> Callable[[float], np.ndarray | None]:
     return pose_at
 
 
-def _video(path: Path, typed: Typed) -> CaptureFiles | None:
+def _video(path: Path, trajectory: Path | None) -> Found | None:
     if not (path.is_file() and is_video(path)):
         return None
     count, fps, size = video_facts(path, "PATH")
-    K = typed[0](size)
-    if K is None:
-        bad_value("K", "given by --K or --fov", "none", "A video does not say its focal length.")
-    pose_at = _trajectory(Path(typed[1])) if typed[1] is not None else lambda t: None
-    frames = [CaptureFrame(f"{n:06d}", path, K, size, pose_at(n / fps), index=n) for n in range(count)]
-    return CaptureFiles(tuple(frames), "video")
+    pose_at = (lambda t: None) if trajectory is None else _trajectory(trajectory)
+    frames = (CaptureFrame(f"{n:06d}", path, pose_at(n / fps), index=n, size=size) for n in range(count))
+    return "video", "m", [(frame, None) for frame in frames]
 
 
-def _images(path: Path, typed: Typed) -> CaptureFiles | None:
+def _images(path: Path, _: Path | None) -> Found | None:
     folders = [_images_of(folder.iterdir()) for folder in (path, path / "images") if folder.is_dir()]
-    frames = []
-    for image in next(filter(None, folders), []):
-        size = upright_size(image, f"{image}")
-        K = typed[0](size)
-        K = intrinsics_from_exif(image, image.name)[0] if K is None else K
-        frames.append(CaptureFrame(image.stem, image, K, size))
-    return CaptureFiles(tuple(frames), "images without poses") if frames else None
+    pairs = [(CaptureFrame(image.stem, image), None) for image in next(filter(None, folders), [])]
+    return ("images without poses", None, pairs) if pairs else None
 
 
 LAYOUTS = (_transforms, _colmap, _tracked, _tum, _video, _images)

@@ -32,9 +32,8 @@ LENS_MODELS = {
     **dict.fromkeys("radtan radial-tangential plumb_bob rational_polynomial".split(), "opencv"),
     **dict.fromkeys("fisheye opencv_fisheye equidistant kannalabrandt4 kannalabrandt8".split(), "fisheye"),
 }
-#: How many coefficients OpenCV's functions take.
 COEFFICIENT_COUNTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
-#: What a reader that takes a whole file for granted raises on one that is not.
+#: What readers raise on a file that is not whole.
 UNFINISHED = (
     *(LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError),
     *(yaml.YAMLError, configparser.Error, ElementTree.ParseError),
@@ -93,7 +92,8 @@ def reading_whole(source: object, summary: str) -> Iterator[None]:
     except InputError as error:
         refuse(f"{source}: {error}")
     except UNFINISHED as error:
-        got = f"no {error}" if isinstance(error, KeyError) else str(error) or "other entries"
+        got = str(error) if isinstance(error, (ValueError, yaml.YAMLError)) else "other entries"
+        got = f"no {error}" if isinstance(error, KeyError) else got
         bad_value(str(source), f"a whole {summary}", got, "Is the file cut off?")
 
 
@@ -144,14 +144,13 @@ def resized(camera: Camera, size: Size, name: str, cure: str) -> Camera:
 
 def of_size(by_size: Mapping[Size, Entry], choice: CameraChoice) -> Entry:
     """What a file has for images of ``choice.image_size``, or all that it has where that is one."""
-    if choice.image_size is None and len(by_size) == 1:
-        return next(iter(by_size.values()))
-    if choice.image_size is None or choice.image_size not in by_size:
+    size = choice.image_size
+    size = next(iter(by_size)) if size is None and len(by_size) == 1 else size
+    if size is None or size not in by_size:
         sizes = ", ".join("{}x{}".format(*size) for size in sorted(by_size)) or "none"
-        got = "no image" if choice.image_size is None else "{}x{}".format(*choice.image_size)
-        cure = "A side-by-side image is two."
-        bad_value("the left image", f"of one of the file's sizes ({sizes})", got, cure)
-    return by_size[choice.image_size]
+        got = "no image" if size is None else "{}x{}. A side-by-side image is two".format(*size)
+        bad_value("the left image", f"of one of the file's sizes ({sizes})", got)
+    return by_size[size]
 
 
 def two_cameras(

@@ -8,7 +8,6 @@ import os
 import re
 import struct
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -71,14 +70,8 @@ def model_files(folder: Path) -> tuple[Path, Path] | None:
 
 
 def calibration_text(path: str | os.PathLike[str]) -> str:
-    """The text of a calibration file, of a COLMAP model without its points; kept until the file changes."""
-    file = check_file(path, "calibration", "a calibration file")
-    state = file.stat()
-    return _calibration_text(file, state.st_size, state.st_mtime_ns)
-
-
-@lru_cache(maxsize=4)
-def _calibration_text(path: Path, size: int, changed_ns: int) -> str:
+    """The text of a calibration file, of a COLMAP model without its points."""
+    path = check_file(path, "calibration", "a calibration file")
     if path.name == "cameras.bin":
         return "\n".join([CAMERAS_MARK, *_binary_cameras(path)])
     if path.name == "images.bin":
@@ -217,7 +210,7 @@ def nerf_frames(text: str) -> dict[str, Frame]:
 
 def _nerf_lens(frame: Frame) -> tuple[str, list[float]]:
     model = str(frame.get("camera_model", "OPENCV_FISHEYE" if frame.get("is_fisheye") else "OPENCV"))
-    if model.lower() not in LENS_MODELS:
+    if model.lower() not in LENS_MODELS:  # is refused with its name
         return model, []
     params = frame.get("distortion_params", [frame.get(key, 0.0) for key in NERF_PARAMS])
     numbers = dict(zip(NERF_PARAMS, array_of(params, (6,), ", ".join(NERF_PARAMS)).tolist(), strict=True))

@@ -57,7 +57,7 @@ RS_EXTRINSIC = re.compile(
     r'^\s*Extrinsic from "Infrared 1"\s+To\s+"Infrared 2"[^\n]*\n(.*?)(?=\n\s*Extrinsic|\Z)', re.M | re.S
 )
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
-#: CAM_B and CAM_C, where every OAK-D has its left and its right camera.
+#: CAM_B and CAM_C, an OAK-D's left and right camera.
 OAK_PAIR = (1, 2)
 
 Entries = dict[str, Any]
@@ -180,12 +180,9 @@ def _rs_printed(text: str, choice: CameraChoice) -> tuple[Camera, Camera, np.nda
         values: Entries = {key.strip().lower(): value.strip() for key, _, value in pairs}
         values |= {"coeffs": NUMBER.findall(values.get("coeffs", "")), "model": values.get("distortion")}
         cameras[side].setdefault((int(values["width"]), int(values["height"])), _rs_camera(values))
-    between = RS_EXTRINSIC.search(text)
-    if not (cameras["1"] and cameras["2"] and between):
-        expected = 'what rs-enumerate-devices -c prints, with "Infrared 1", "Infrared 2" and the extrinsics'
-        bad_value("the file", expected, "less", "Is the file cut off?")
     left, right = (of_size(cameras[side], choice) for side in "12")
-    rotation, translation = (NUMBER.findall(part) for part in between[1].partition("Translation")[::2])
+    between = [*RS_EXTRINSIC.findall(text), ""][0]
+    rotation, translation = (NUMBER.findall(part) for part in between.partition("Translation")[::2])
     return left, right, transform(rotation[:9], translation[:3], "the extrinsics")
 
 
@@ -335,11 +332,11 @@ def _numbers(value: Any) -> np.ndarray | None:
 
 def _pinhole(entries: Entries, coefficients: str) -> Camera:
     """A camera of Kalibr or EuRoC; ``coefficients`` names the entry with those of its lens."""
-    if entries["camera_model"] != "pinhole":
-        cure = "Calibrate with pinhole-radtan or pinhole-equi, or undistort the images to a pinhole first."
-        bad_value("camera_model", "pinhole", repr(entries["camera_model"]), cure)
-    K = intrinsics(*entries["intrinsics"])
-    return Camera(K, entries["resolution"], entries[coefficients], str(entries["distortion_model"]))
+    model = entries["camera_model"]  # of another one the lens is refused
+    model = str(entries["distortion_model"] if model == "pinhole" else model)
+    return Camera(
+        intrinsics(*entries["intrinsics"][-4:]), entries["resolution"], entries[coefficients], model
+    )
 
 
 def read_kalibr(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
@@ -390,11 +387,10 @@ def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 
 
 def _orb_camera(entries: Entries, name: str, kind: str) -> Camera:
-    """The camera of a name; a pinhole may leave its coefficients out, or the last one."""
-    lens = ORB_LENSES[kind]
-    there = [key for key in lens if f"{name}.{key}".lower() in entries]
-    keys = ("fx", "fy", "cx", "cy", *(() if kind == "PinHole" and not there else lens[: max(4, len(there))]))
-    numbers = [float(array_of(entries.get(f"{name}.{key}".lower()), (), f"{name}.{key}")) for key in keys]
+    """The camera of a name; a pinhole may leave coefficients out, which are 0 then."""
+    keys, default = ("fx", "fy", "cx", "cy", *ORB_LENSES.get(kind, ())), 0.0 if kind == "PinHole" else None
+    given = {key: entries.get(f"{name}.{key}".lower(), default if key[0] in "kp" else None) for key in keys}
+    numbers = [array_of(value, (), f"{name}.{key}") for key, value in given.items()]
     size = [entries.get(f"camera.{side}", [None])[0] for side in ("width", "height")]
     return Camera(intrinsics(*numbers[:4]), size, numbers[4:], kind)
 
@@ -406,8 +402,6 @@ def read_orb_slam(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     left = "Camera1" if "camera1.fx" in entries else "Camera"
     pose = next((name for name in ORB_POSES if name.lower() in entries), None)
     if pose is not None:
-        if kind not in ORB_LENSES:
-            bad_value("Camera.type", f"{' or '.join(ORB_LENSES)} beside {pose}", repr(kind))
         first, second = (_orb_camera(entries, name, kind) for name in (left, "Camera2"))
         return make_rig(first, second, rigid(entries[pose.lower()], pose))
     baseline, types = ORB_RECTIFIED[left]
@@ -420,7 +414,7 @@ def read_orb_slam(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     camera = _orb_camera(entries, left, "PinHole")
     if np.any(camera.coefficients):
         expected = f"zero for rectified images, which have no {ORB_POSES[0]}"
-        bad_value(f"Lens distortion of {left}", expected, camera.coefficients, "Is it of a single camera?")
+        bad_value(f"Lens distortion of {left}", expected, "another", "Is it of a single camera?")
     length = array_of(entries[baseline.lower()], (), baseline)
     return make_rig(camera, camera, length / (1.0 if left == "Camera1" else camera.K[0, 0]), rectified=True)
 
