@@ -24,7 +24,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from tqdm import tqdm
 
@@ -65,7 +65,8 @@ def _readable(part: Any) -> Any:
     return [_readable(value) for value in part] if isinstance(part, (list, tuple)) else part
 
 
-class Process(NamedTuple):
+@dataclass(frozen=True)
+class Process:
     """Which of how many processes of a launcher this one is, from 0, and its index on its own machine."""
 
     index: int

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -75,7 +75,7 @@ class CaptureFiles:
 
 
 #: What a layout's reader finds: its kind, its unit, and the frames, each with its camera as the file has it.
-Found = tuple[str, str | None, list[tuple[CaptureFrame, Camera | None]]]
+Found = tuple[str, str | None, Sequence[tuple[CaptureFrame, Camera | None]]]
 
 
 def read_capture(
