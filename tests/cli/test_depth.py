@@ -14,9 +14,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from geodiff_plugin.bundled.demo_pair import DemoPair
-from geodiff_plugin.cli.demo import measure, run_bench
-from geodiff_plugin.types import Rig
 from tests.cli.conftest import QUICK, report_of
 from tests.contracts.tiny_priors import TINY
 
@@ -31,21 +28,10 @@ def names_in(folder: str) -> set[str]:
     return {path.name for path in Path(folder).iterdir()}
 
 
-@pytest.fixture
-def lidar(pair_files):
-    """Writes a map of known depths: a function of where it is known and what it holds there."""
-
-    def write(depth_m, where=np.s_[::4, ::4]) -> np.ndarray:
-        known = np.zeros((48, 64), np.float32)
-        known[where] = depth_m
-        np.save("lidar.npy", known)
-        return known
-
-    return write
-
-
-def test_points_without_a_right_image_and_a_cloud_of_what_is_believed(geodiff, command, lidar):
-    lidar(np.linspace(1.5, 3.0, 16)[None])
+def test_points_without_a_right_image_and_a_cloud_of_what_is_believed(geodiff, command):
+    known = np.zeros((48, 64), np.float32)
+    known[::4, ::4] = np.linspace(1.5, 3.0, 16)
+    np.save("lidar.npy", known)
     camera = "--fx 60 --fy 60 --cx 31.5 --cy 23.5 --points lidar.npy --steps 1".split()
     alone = [*command[:2], *camera, *command[5:]]
     answer = geodiff(*alone, "--json", "-q", "--min-confidence", 0.6)
@@ -56,7 +42,9 @@ def test_points_without_a_right_image_and_a_cloud_of_what_is_believed(geodiff, c
     doubtful, counts = np.load("geodiff-out/confidence.npy") < 0.6, report["files"]
     assert counts["doubtful_points"] == doubtful.sum()
     assert counts["cloud_points"] <= doubtful.size - doubtful.sum()
-    lidar(2.0, np.s_[20, 30])
+    known[:] = 0
+    known[20, 32] = 2.0
+    np.save("lidar.npy", known)
     answer = geodiff(*alone, "--strict", "--out", "strict")
     assert answer.code == 2 and "Too few known depths to fix both scale and shift, 1;" in answer.err
     assert not Path("strict").exists()
@@ -80,9 +68,8 @@ def test_a_further_view_takes_part_with_a_lens_of_its_own(geodiff, command, text
 
 
 def test_writes_everything(geodiff, command):
-    answer = geodiff(*command)
+    answer, out = geodiff(*command), Path("geodiff-out")
     assert answer.code == 0, answer.err
-    out = Path("geodiff-out")
     assert names_in(out) == FILES | CONFIDENCE
     assert answer.out.count("\n") == 1 and " m to " in answer.out and "geodiff-out/" in answer.out
     assert "loss=" in answer.err
@@ -92,11 +79,9 @@ def test_writes_everything(geodiff, command):
     near = depth_m < 65.5
     np.testing.assert_allclose(millimetres[near] / 1000, depth_m[near], atol=5.1e-4)
     assert (millimetres[depth_m > 65.536] == 0).all()
-    visible = np.asarray(Image.open(out / "visible.png"))
-    assert visible.shape == (48, 64) and set(np.unique(visible)) <= {0, 255}
-    assert np.load(out / "photometric_error.npy").shape == (48, 64)
-    confidence = np.load(out / "confidence.npy")
-    assert confidence.shape == (48, 64) and 0.0 <= confidence.min() <= confidence.max() <= 1.0
+    visible, confidence = np.asarray(Image.open(out / "visible.png")), np.load(out / "confidence.npy")
+    assert visible.shape == confidence.shape == np.load(out / "photometric_error.npy").shape == (48, 64)
+    assert set(np.unique(visible)) <= {0, 255} and 0.0 <= confidence.min() <= confidence.max() <= 1.0
     assert set(report["files"]["names"]) == FILES | CONFIDENCE and report["files"]["doubtful_points"] == 0
     assert report["depth"]["median_m"] == pytest.approx(float(np.median(depth_m)))
     assert report["depth"]["visible_fraction"] == pytest.approx((visible > 0).mean())
@@ -124,24 +109,11 @@ def test_seeds_presets_and_range(geodiff, command):
     for out, seed in (("a", 1), ("b", 1), ("c", 2)):
         assert geodiff(*words, *QUICK, "--seed", seed, "--out", out).code == 0
     a, b, c = (np.load(f"{out}/depth.npy") for out in "abc")
-    np.testing.assert_array_equal(a, b)
-    assert not np.array_equal(a, c)
+    assert np.array_equal(a, b) and not np.array_equal(a, c)
     paper = report_of("a")["guidance"]
     assert paper["gradient"] == "full" and paper["g_s_range"] == [1.0, 5.0]
     guidance = json.loads(geodiff(*words, "--json", "--steps", 1).out)["guidance"]
     assert guidance["gradient"] == "denoised" and guidance["depth_range"] == [1.0, 5.0]
-
-
-def test_the_right_cameras_centre(geodiff, command, pair_files):
-    """Assumed where it is not given, and said; with it depth is of another disparity."""
-    numbers = "--fx 60 --fy 60 --cx 31.5 --cy 23.5 --baseline 0.12".split()
-    camera = [*pair_files.images, *numbers, *command[5:], *QUICK]
-    answer = geodiff(*camera, "--out", "same")
-    assert answer.code == 0 and "assumed: The right camera's cx" in answer.err and "--cx-right" in answer.err
-    answer = geodiff(*camera, "--cx-right", 33.5, "--out", "other")
-    assert answer.code == 0 and "assumed" not in answer.err
-    assert report_of("other")["inputs"]["K_right"][0][2] == 33.5
-    assert report_of("same")["assumed"] and not report_of("other")["assumed"]
 
 
 def test_interrupt_of_a_running_process(command, pair_files):
@@ -166,38 +138,23 @@ def test_interrupt_of_a_running_process(command, pair_files):
 
 
 def test_demo(geodiff, prior, pair_files, monkeypatch):
-    """Over the folder of an earlier run; the tiny prior stands in for the bundled one."""
+    """The tiny prior stands in for the bundled one."""
     monkeypatch.setattr("geodiff_plugin.priors.loading.BUNDLED_FOLDER", prior)
-    out = pair_files.folder / "geodiff-demo"
-    out.mkdir()
-    for name in ("depth.npy", "uncertainty.npy", "notes.txt"):
-        (out / name).write_text("of an earlier run, but for the notes")
-    (out / "report.json").write_text('{"files": {"names": ["depth.npy", "uncertainty.npy"]}}')
-    answer = geodiff("demo", "--quiet", "--overwrite")
+    answer = geodiff("demo", "--quiet")
     assert answer.code == 0, answer.err
     assert "AbsRel" in answer.out and "delta1" in answer.out and "guided" in answer.out
     assert f"Open {Path('geodiff-demo', 'comparison.png')} first" in answer.out
-    assert names_in(out) == FILES | CONFIDENCE | {"comparison.png", "notes.txt"}
-    assert np.load(out / "depth.npy").shape == (336, 448)
+    assert names_in("geodiff-demo") == FILES | CONFIDENCE | {"comparison.png"}
+    assert np.load("geodiff-demo/depth.npy").shape == (336, 448)
 
 
 # Priors
 
 
-@pytest.fixture
-def saved(tmp_path):
-    """Factory: the folder of a tiny prior."""
-
-    def save(key: str) -> Path:
-        TINY[key]().save_pretrained(tmp_path / key)
-        return tmp_path / key
-
-    return save
-
-
 @pytest.mark.parametrize(("key", "space"), [("lotus", "disparity"), ("depthmaster", "sqrt_disparity")])
-def test_info_tells_what_the_adapter_found(geodiff, saved, key, space):
-    folder = saved(key)
+def test_info_tells_what_the_adapter_found(geodiff, tmp_path, key, space):
+    folder = tmp_path / key
+    TINY[key]().save_pretrained(folder)
     (folder / "README.md").write_text("---\nlicense: cc-by-4.0\n---\n")
     answer = geodiff("info", "--prior", folder)
     assert answer.code == 0 and "torch" in answer.out, answer.err
@@ -211,8 +168,9 @@ def test_info_tells_what_the_adapter_found(geodiff, saved, key, space):
     assert "  smoothness = 40" in knobs and "  weights = photometric 1" in knobs
 
 
-def test_geowizard_with_its_option(geodiff, saved, command):
-    prior = ["--prior", saved("geowizard"), "--steps", "1", "--resolution", "32"]
+def test_geowizard_with_its_option(geodiff, tmp_path, command):
+    TINY["geowizard"]().save_pretrained(tmp_path / "geowizard")
+    prior = ["--prior", "geowizard", "--steps", "1", "--resolution", "32"]
     answer = geodiff(*command[:5], *prior, "--option", "domain=outdoor", "--out", "out")
     assert answer.code == 0 and "(geowizard; licence unknown)" in answer.err, answer.err
     normals = np.load("out/normals.npy")
@@ -227,9 +185,7 @@ def test_geowizard_with_its_option(geodiff, saved, command):
         (["--option", "domain=outdoor"], "--option must be one that marigold takes (none); got 'domain'"),
         (["--prior", "developy/ApDepth"], "It is refused because"),
         (["--prior", "no/such-prior"], "bundled"),
-        (["--prior", "map"], "--prior map and no --prior-map"),
         (["--prior-map", "none.npy"], "in place of a --prior"),
-        (["--prior-map", "none.npy", "--prior", "bundled"], "none.npy"),
     ],
 )
 def test_priors_that_cannot_be(geodiff, command, options, said, monkeypatch):
@@ -249,25 +205,10 @@ def test_a_map_of_another_model_as_the_prior(geodiff, pair_files, textured_plane
     assert np.median(np.abs(np.load("out/depth.npy") / truth - 1)) < 0.05
 
 
-@pytest.mark.parametrize("gradient", [None, "denoised", "full"])
-def test_measure(make_pipeline, textured_plane, tmp_path, monkeypatch, gradient):
-    make_pipeline().save_pretrained(tmp_path)
-    left, right = (image / np.float32(255) for image in (textured_plane.left, textured_plane.right))
-    depth_m = textured_plane.depth_m
-    rig = Rig(textured_plane.K, textured_plane.K, textured_plane.E)
-    pair = DemoPair(left, right, rig, depth_m, depth_m > 0)
-    monkeypatch.setattr("geodiff_plugin.cli.demo.read_demo_pair", lambda: pair)
-    monkeypatch.setattr("geodiff_plugin.priors.BUNDLED_FOLDER", tmp_path)
-    seconds, peak_bytes = measure(gradient, "cpu", repeats=0, inner_steps=2)
-    assert seconds > 0 and peak_bytes >= 0
-
-
-def test_table(monkeypatch, capsys):
-    costs = {None: (1.0, 100e6), "denoised": (2.0, 150e6), "full": (3.0, 400e6)}
+def test_bench(monkeypatch, geodiff, prior):
+    """The tiny prior stands in for the bundled one, and this process for the fresh ones."""
 
     class Inline:
-        """Stands in for the executor: the same calls, in this process, with made-up costs."""
-
         def __init__(self, **_):
             pass
 
@@ -277,14 +218,13 @@ def test_table(monkeypatch, capsys):
         def __exit__(self, *_):
             pass
 
-        def submit(self, function, gradient, *_):
-            assert function is measure
-            return SimpleNamespace(result=lambda: costs[gradient])
+        def submit(self, function, *arguments):
+            return SimpleNamespace(result=lambda: function(*arguments, repeats=0, inner_steps=1))
 
     monkeypatch.setattr("geodiff_plugin.cli.demo.ProcessPoolExecutor", Inline)
-    run_bench("cpu")
-    printed = capsys.readouterr().out
+    monkeypatch.setattr("geodiff_plugin.priors.loading.BUNDLED_FOLDER", prior)
+    printed = geodiff("bench", "--device", "cpu").out
     assert re.search(r"geodiff depth: [\d.]+ s \(start .*guided call [\d.]+, write", printed)
-    lines = [line.split() for line in printed.splitlines()]
-    rows = [words[-4:] for words in lines if words and re.fullmatch(r"\d\.\d\d", words[-1])]
-    assert rows[1] == ["2.00", "150", "2.00", "1.50"] and rows[2] == ["3.00", "400", "3.00", "4.00"]
+    rows = [line.split() for line in printed.splitlines() if line.lstrip().startswith(("plain", "guided,"))]
+    seconds, ratios = zip(*((float(words[-4]), float(words[-2])) for words in rows), strict=True)
+    assert len(rows) == 3 and ratios == pytest.approx([each / seconds[0] for each in seconds], rel=0.1)

@@ -4,6 +4,7 @@ import json
 import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -138,68 +139,37 @@ def test_every_photograph_has_its_lens():
         ([None, None, None], {"view": view, "view_k": view}),
     ):
         assert told(**given) == expected, given
-    with pytest.raises(InputError, match="--view-distortion must be given for each"):
-        told(own=own, view=view, view_k=view)
+    for error, given in (
+        ("--view-distortion must be given for each", {"view": view, "view_k": view}),
+        ("--prior-map must be of an image without lens distortion", {"prior_map": Path("map.npy")}),
+    ):
+        with pytest.raises(InputError, match=error):
+            told(own=own, **given)
 
 
-FOUR = {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
-
-
-LENS = "0.2,0,0,0"
-
-
-def straight(x: float, y: float) -> tuple[float, float]:
-    """Where a pixel behind that lens lies without it: r (1 + 0.2 r^2) = R, solved by bisection."""
-    ray = np.array([x - 31.5, y - 23.5]) / 60
-    far, low, high = float(np.linalg.norm(ray)), 0.0, 2.0
-    for _ in range(60):
-        r = (low + high) / 2
-        low, high = (r, high) if r * (1 + 0.2 * r * r) < far else (low, r)
-    u, v = ray / far * r * 60 + (31.5, 23.5)
-    return float(u), float(v)
-
-
-@pytest.fixture
-def millimetres(pair_files) -> Path:
-    """A map of two depths, 2 m at (10, 12) and 3 m at (50, 40)."""
-    depth = np.zeros((48, 64))
+def test_the_estimation_of_poses_is_told_what_it_needs(pair_files, monkeypatch):
+    """Points in metres and a known length, both where an image without lens distortion has them."""
+    depth, ends = np.zeros((48, 64)), np.array([[10.0, 12.0], [50.0, 40.0]])
     depth[12, 10], depth[40, 50] = 2000.0, 3000.0
     np.save("mm.npy", depth)
-    return Path("mm.npy")
+    K, told = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]]), {}
 
+    def stop(_images, **options):
+        told.update(options)
+        raise InterruptedError
 
-def expected_points() -> np.ndarray:
-    at = np.array([straight(10, 12), straight(50, 40)])
-    return np.c_[(at - (31.5, 23.5)) / 60, np.ones(2)] * [[2.0], [3.0]]
-
-
-@pytest.fixture
-def told_to_estimate(pair_files, monkeypatch):
-    """What the estimation of poses is called with."""
-
-    def tell(**given) -> dict:
-        told = {}
-
-        def stop(_images, **options):
-            told.update(options)
-            raise InterruptedError
-
-        monkeypatch.setattr(GeometryGuidance, "from_photographs", stop)
-        options = DepthOptions(**VIEWS, device="cpu", estimate_pose=True, **FOUR | given)
+    monkeypatch.setattr(GeometryGuidance, "from_photographs", stop)
+    known = {"points": Path("mm.npy"), "points_scale": 1000.0, "known_length": "10,12,50,40,1.5"}
+    known |= {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5, "cropped": True}
+    for distortion in ((), ("0.2,0,0,0",)):
+        options = DepthOptions(**VIEWS, device="cpu", estimate_pose=True, distortion=distortion, **known)
         with pytest.raises(InterruptedError):
             read_inputs(options)
-        return told
-
-    return tell
-
-
-def test_the_estimation_of_poses_is_told_what_it_needs(told_to_estimate, millimetres):
-    """Points in metres and a known length, both where an image without lens distortion has them."""
-    known = {"points": millimetres, "points_scale": 1000.0, "known_length": "10,12,50,40,1.5"}
-    told = told_to_estimate(**known, cropped=True)
-    assert told["points"].shape == (48, 64) and told["points"][12, 10] == 2.0
-    assert told["known_length"] == (10, 12, 50, 40, 1.5) and told["cropped"] is True
-    told = told_to_estimate(**known, distortion=(LENS,))
-    np.testing.assert_allclose(told["points"], expected_points(), atol=1e-4)
-    ends = (*straight(10, 12), *straight(50, 40), 1.5)
-    assert told["known_length"] == pytest.approx(ends, abs=0.01)
+        assert told["cropped"] is True
+        if not distortion:
+            assert told["points"].shape == (48, 64) and told["points"][12, 10] == 2.0
+            assert told["known_length"] == (10, 12, 50, 40, 1.5)
+    at = cv2.undistortPoints(ends, K, np.array([0.2, 0, 0, 0]), P=K)[:, 0]
+    rays = np.c_[at, np.ones(2)] @ np.linalg.inv(K).T
+    np.testing.assert_allclose(told["points"], rays * [[2.0], [3.0]], atol=1e-3)
+    assert told["known_length"] == pytest.approx((*at.reshape(-1), 1.5), abs=0.01)

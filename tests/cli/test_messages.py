@@ -88,18 +88,12 @@ def test_names_beyond_the_terminals_encoding(monkeypatch, tmp_path):
         assert words in stream.buffer.getvalue()
 
 
-def test_summary():
+def test_the_summary_says_the_verdict_first():
     depth = np.array([[1.0, 2.0], [4.0, np.nan]], dtype=np.float32)
-    summary = depth_summary(depth, np.array([[True, True], [True, False]]))
+    summary, signs = depth_summary(depth, depth > 0), {"confidence": 0.876, "matched": 0.7, "points": 0}
     assert summary["invalid_pixels"] == 1 and summary["median_m"] == 2.0
-    signs = {"confidence": 0.876, "matched": 0.7, "points": 0}
-    verdict = {"status": "trusted", "reasons": [], "signs": signs}
-    report = {"depth": summary, "verdict": verdict, "seconds": {"load": 1.0, "write": 0.5}}
-    report |= {"unit": "m", "own_scale": None}
-    metres = "1.00 m to 4.00 m, median 2.00 m"
-    assert summary_line(report, "out/") == f"{metres}; trusted, confidence 0.88, 70 % matched; 1.5 s -> out/"
-    verdict |= {"status": "not trusted", "reasons": ["E is wrong.", "So is K."]}
-    said = f"NOT TRUSTED: E is wrong. (Unconfirmed: {metres}; 1.5 s -> out/)"
-    assert summary_line(report, "out/") == said, "the verdict first, and no confidence"
-    verdict |= {"status": "not judged", "reasons": []}
-    assert summary_line(report, "out/").startswith("NOT JUDGED: ")
+    verdict, metres = {"status": "trusted", "reasons": [], "signs": signs}, "1.00 m to 4.00 m, median 2.00 m"
+    report = {"depth": summary, "verdict": verdict, "seconds": {"load": 1.0}, "unit": "m", "own_scale": None}
+    assert summary_line(report, "out/") == f"{metres}; trusted, confidence 0.88, 70 % matched; 1.0 s -> out/"
+    verdict |= {"status": "not trusted", "reasons": ["E is wrong."]}
+    assert summary_line(report, "out/") == f"NOT TRUSTED: E is wrong. (Unconfirmed: {metres}; 1.0 s -> out/)"

@@ -3,7 +3,6 @@
 import asyncio
 import gc
 import json
-import math
 import threading
 from dataclasses import replace
 from zipfile import ZipFile
@@ -23,7 +22,6 @@ from geodiff_plugin.app.results import (
     legend_of_confidence,
     legend_of_depth,
     map_of,
-    marked,
     measurement,
     metres,
     read_pixel,
@@ -41,9 +39,8 @@ def test_a_point_is_where_its_ray_ends():
     assert reading.depth_m == 2 and reading.spread is None and reading.confidence is None
     a, b = (read_pixel(DEPTH, K, pixel) for pixel in ((1, 10), (61, 10)))
     assert distance_m(a, b) == (pytest.approx(2.0), None)
-    for outside in ((64, 0), (0, 48), (-1, 0)):
-        with pytest.raises(ValueError, match="inside the map of 64x48"):
-            read_pixel(DEPTH, K, outside)
+    with pytest.raises(ValueError, match="inside the map of 64x48"):
+        read_pixel(DEPTH, K, (64, 0))
 
 
 def test_spread_is_that_of_a_normal_error_with_this_confidence():
@@ -93,14 +90,13 @@ def test_fields_become_options_and_those_of_another_way_are_left_out(photographs
     assert turned.estimate_pose and turned.cx == 23.5 and turned.cx_right is None
 
 
-def test_what_a_visitor_left_out_or_gave_wrongly(photographs, tmp_path, monkeypatch):
-    (tmp_path / "words.png").write_text("no image")
+def test_what_a_visitor_left_out_or_gave_wrongly(photographs, monkeypatch):
     for left, way, said in (
         (photographs[0], "numbers", "fx and baseline must be given"),
         (photographs[0], "photographs", "the distance of the cameras must be given"),
         (photographs[0], "file", "calibration must be a calibration file"),
         (None, "file", "the left photograph must be given"),
-        (str(tmp_path / "words.png"), "file", "the left photograph must be an image file"),
+        (__file__, "file", "the left photograph must be an image file"),
     ):
         with pytest.raises(ValueError, match=said):
             options_of(left, photographs[1], way)
@@ -112,12 +108,11 @@ def test_what_a_visitor_left_out_or_gave_wrongly(photographs, tmp_path, monkeypa
 @pytest.mark.filterwarnings("ignore:.*has no unit")
 def test_a_calibration_without_a_unit_needs_the_distance(photographs, priors, tmp_path):
     frames = [
-        {"file_path": f"{side}.png", "transform_matrix": np.eye(4).tolist()} for side in ("left", "right")
+        {"file_path": f"{side}.png", "transform_matrix": (np.eye(4) + x * np.eye(4, k=3)).tolist()}
+        for side, x in (("left", 0), ("right", 0.5))
     ]
-    frames[1]["transform_matrix"][0][3] = 0.5
-    lens = {"fl_x": 60.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
     path = tmp_path / "transforms.json"
-    path.write_text(json.dumps(lens | {"frames": frames}))
+    path.write_text(json.dumps({"fl_x": 60.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "frames": frames}))
     with pytest.raises(ValueError, match="the distance of the cameras must be given.*has no unit"):
         run(options_of(*photographs, "file", (str(path),), prior="tiny"), priors)
 
@@ -134,20 +129,15 @@ def asked(photographs):
     return options_of(*photographs, "numbers", (), 0.12, None, {"fx": 60.0}, prior="tiny", steps=1)
 
 
-def ignore(*_):
-    pass
-
-
 def run(options, priors):
-    return run_job(options, priors, threading.Event(), ignore)
+    return run_job(options, priors, threading.Event(), lambda *_: None)
 
 
 @pytest.fixture(scope="module")
 def result(priors, asked):
     said = []
     done = run_job(replace(asked, ensemble=2), priors, threading.Event(), lambda *now: said.append(now))
-    shares = [share for share, _ in said]
-    assert shares == sorted(shares) and 0 <= min(shares) <= max(shares) <= 1
+    assert said == sorted(said) and 0 <= said[0][0] <= said[-1][0] <= 1
     assert any("Guided step" in name for _, name in said)
     return done
 
@@ -177,10 +167,7 @@ def test_a_job_and_its_files(result):
 def test_points_are_marked_where_they_were_clicked_and_told_in_words(result):
     picture, words = measurement(result, [(5, 5), (50, 40), (20, 20)])
     assert picture.shape == (48, 64, 3) and "Distance A to B" in words and "second point" in words
-    black, pixels = np.zeros((100, 200, 3), np.uint8), [(20, 50), (180, 50)]
-    drawn = marked(black, pixels, [read_pixel(np.full((100, 200), 2.0), K, pixel) for pixel in pixels])
-    assert drawn[50, 20].tolist() == drawn[50, 180].tolist() == [0xC2, 0x41, 0x0C]
-    assert drawn[50, 100].tolist() == [255, 255, 255] and not black.any()
+    assert picture[5, 5].tolist() == picture[40, 50].tolist() == [0xC2, 0x41, 0x0C]
     assert ">5 m</span>" in legend_of_depth(np.geomspace(1, 10, 1000).reshape(20, 50))
     assert ">50 %</span>" in legend_of_confidence()
 
@@ -202,10 +189,7 @@ def test_a_stop_ends_a_job_between_steps(priors, asked):
     [
         ({"prior": "/etc"}, "prior must be one of"),
         ({"near": 3.0, "far": 2.0}, "the nearest depth must be less than the farthest depth; got 3 and 2"),
-        ({"near": math.nan, "far": 5.0}, "the nearest depth must be a finite number .* above 0; got nan"),
-        ({"steps": 1000}, "steps must be between"),
         ({"ensemble": 21}, "members must be between 0 and 20"),
-        ({"resolution": 10_000}, "resolution must be between"),
     ],
 )
 def test_settings_that_a_job_refuses(priors, asked, changes, said):
@@ -286,6 +270,6 @@ class TestWithGradio:
             raise OSError("Cannot find empty port in range: 8000-8000.")
 
         monkeypatch.setattr(launch, "launch_page", taken)
-        monkeypatch.setattr("signal.signal", ignore)
+        monkeypatch.setattr("signal.signal", lambda *_: None)
         with pytest.raises(ValueError, match=r"--port must be free to listen on; got 127.0.0.1 and 8000"):
             launch.run_app(("bundled",), "cpu", "127.0.0.1", 8000, False)
