@@ -1,11 +1,9 @@
 """Run the command line inside the test's process, and write a small pair for it to read."""
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -27,27 +25,11 @@ def report_of(folder: str | Path = "geodiff-out") -> dict:
     return json.loads(Path(folder, "report.json").read_text())
 
 
-@dataclass(frozen=True)
-class PairFiles:
-    """Files of a rendered plane: two images, a calibration, and the arguments that name them."""
-
-    folder: Path
-    left: Path
-    right: Path
-    calib: Path
-
-    @property
-    def images(self) -> list[str]:
-        return ["depth", str(self.left), str(self.right)]
-
-    @property
-    def command(self) -> list[str]:
-        return [*self.images, "--calib", str(self.calib)]
-
-
-def write_pair(folder: Path, pair) -> PairFiles:
-    """Images, and a calibration in Middlebury's format."""
-    files = PairFiles(folder, folder / "left.png", folder / "right.png", folder / "calib.txt")
+def write_pair(folder: Path, pair) -> SimpleNamespace:
+    """Images, a calibration in Middlebury's format, and the arguments that name them."""
+    files = SimpleNamespace(folder=folder, left=folder / "left.png", right=folder / "right.png")
+    files.calib, files.images = folder / "calib.txt", ["depth", str(files.left), str(files.right)]
+    files.command = [*files.images, "--calib", str(files.calib)]
     Image.fromarray(pair.left).save(files.left)
     Image.fromarray(pair.right).save(files.right)
     K, (height, width) = pair.K, pair.left.shape[:2]
@@ -60,7 +42,7 @@ def write_pair(folder: Path, pair) -> PairFiles:
 
 
 @pytest.fixture
-def pair_files(tmp_path, textured_plane, monkeypatch) -> PairFiles:
+def pair_files(tmp_path, textured_plane, monkeypatch) -> SimpleNamespace:
     """The pair in a fresh folder, which is also the working directory."""
     monkeypatch.chdir(tmp_path)
     return write_pair(tmp_path, textured_plane)
@@ -101,8 +83,3 @@ def result(prior, textured_plane, tmp_path_factory):
         words += ["--prior", prior, "--device", "cpu", "--export", "glb", "--export", "colmap", "-q"]
         assert call(words) == 0
     return folder
-
-
-def save_maps(folder: Path, **maps: np.ndarray) -> None:
-    for name, values in maps.items():
-        np.save(folder / f"{name}.npy", values)

@@ -85,6 +85,10 @@ FILES: dict[str, Any] = {
 }
 
 
+def words_of(typed: str) -> list[str]:
+    return " ".join(WORDS.get(word, word) for word in typed.split()).split()
+
+
 def write_files() -> None:
     for name, content in FILES.items():
         path = Path(name)
@@ -121,12 +125,11 @@ def run(words):
 
 @pytest.mark.parametrize("typed", MESSAGES)
 def test_bad_input(typed, geodiff, pair_files, monkeypatch):
-    for module in ("depth", "many"):
-        monkeypatch.setattr(f"geodiff_plugin.cli.{module}.load_guided_prior", never)
+    monkeypatch.setattr("geodiff_plugin.cli.depth.find_prior", never)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     write_files()
     before = sorted(pair_files.folder.rglob("*"))
-    answer = geodiff(*" ".join(WORDS.get(word, word) for word in typed.split()).split())
+    answer = geodiff(*words_of(typed))
     assert (answer.code, answer.out) == (2, ""), answer
     *warned, line = answer.err.strip().splitlines()
     assert all(each.startswith("warning: ") for each in warned), answer.err
@@ -141,32 +144,23 @@ def test_bad_input(typed, geodiff, pair_files, monkeypatch):
 
 def test_what_needs_no_torch_is_said_without_it(pair_files):
     """In one process: options, files, the folder; and that good ones do import it."""
-    folder = pair_files.folder
-    (folder / "geodiff-out").mkdir()
-    np.save(folder / "geodiff-out" / "x.npy", np.ones(3))
-    cases = [
-        (["--steps", "0"], "--steps"),
-        (["--out", "left.png"], "--out must be a folder; got the file left.png"),
-        (["--out", "geodiff-out"], "--overwrite"),
-        (["--near", "3"], "--far"),
-        (["--view", "left.png"], "--view-E"),
-        (["--calib", "nothing.txt"], "nothing.txt"),
-        (["--fx", "60"], "one way"),
-        ([], "imported"),  # the folder that is taken is numbered
-    ]
-    commands = [([*pair_files.command, *more], word) for more, word in cases]
+    write_files()
+    Path("geodiff-out").mkdir()
+    Path("geodiff-out", "x.npy").touch()
+    rows = ["--steps 0", "--out left.png", "--out .", "--near 1", "--view third.png", "--fx 60"]
+    rows = [f"depth GOOD {row}" for row in rows] + ["depth PAIR --calib nothing.txt"]
+    commands = [(words_of(row), MESSAGES[row]) for row in rows]
     commands += [
-        (["depth", "left.png", "calib.txt", "--calib", "calib.txt"], "RIGHT"),
+        (words_of("depth GOOD"), "imported"),  # the folder that is taken is numbered
         (["demo", "--out", "left.png"], "--out must be a folder; got the file left.png"),
         (["eval", "pairs", "synthetic:1", "--out", "left.png"], "--out must be a folder"),
     ]
-    before = sorted(folder.iterdir())
+    before = sorted(Path().iterdir())
     code = f"{WITHOUT_TORCH}\nfor words in {[words for words, _ in commands]!r}:\n    run(words)\n"
-    answer = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True)
-    said = answer.stderr.split("END\n")[:-1]
-    for text, (words, word) in zip(said, commands, strict=True):
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    for text, (words, word) in zip(answer.stderr.split("END\n")[:-1], commands, strict=True):
         assert word in text and text.count("\n") == 1, (words, text)
-    assert sorted(folder.iterdir()) == before
+    assert sorted(Path().iterdir()) == before
 
 
 def test_names_that_are_known_without_torch_are_those_with_it():

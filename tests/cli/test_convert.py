@@ -11,10 +11,9 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
-from geodiff_plugin.cli.convert import merged, read_prompt, run_convert
+from geodiff_plugin.cli.convert import run_convert
 from geodiff_plugin.priors import find_prior, load_prior
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
-from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
 from geodiff_plugin.priors.ppd import PixelDiT
 from tests.conftest import make_text_encoder, make_tokenizer, make_vae
 from tests.contracts.tiny_priors import make_ppd
@@ -24,7 +23,6 @@ from tests.parity.depthmaster_reference import UNET
 from tests.parity.named_weights import fill, named_state
 
 FIXTURE = Path(__file__).parents[1] / "parity" / "fixtures" / "depthfm.npz"
-IMAGE = np.random.default_rng(0).random((32, 48, 3), np.float32)
 
 
 def refused(answer, folder, left: set[str], *parts: str) -> None:
@@ -170,6 +168,9 @@ def test_ppd_takes_its_encoder_from_a_folder_of_transformers(convert, tmp_path):
 # Marigold V2 ---------------------------------------------------------------------------------------------
 
 
+KEPT = {"base", "V2", "elsewhere"}
+
+
 @pytest.fixture
 def assets(tmp_path):
     """A tiny base in shards, one checkpoint, the prompt's two files."""
@@ -197,20 +198,13 @@ def convert_v2(geodiff, assets):
     return run
 
 
-KEPT = {"base", "V2", "elsewhere"}
-
-
 def test_a_merged_v2_loads_and_keeps_files_and_index(convert_v2, assets):
     """Its numbers are those of the parity tests."""
     answer = convert_v2()
     assert answer.code == 0, answer.err
     found = find_prior(assets / "out")
     assert (found.key, found.licence) == ("marigold-v2", "apache-2.0")
-    ours, stock = found.load(), MarigoldV2Pipeline.from_pretrained(assets / "out")
-    for pipe in (ours, stock):
-        pipe.set_progress_bar_config(disable=True)
-    maps = [pipe(IMAGE, processing_resolution=0).prediction for pipe in (ours, stock)]
-    assert np.array_equal(*maps) and ours.prompt.embedding.shape == (1, reference.KNOWN, 16)  # not padded
+    assert found.load().prompt.embedding.shape == (1, reference.KNOWN, 16), "not padded"
     folder = assets / "out" / "transformer"
     files = sorted(folder.glob("*.safetensors"))
     index = json.loads((folder / "diffusion_pytorch_model.safetensors.index.json").read_text())
@@ -218,9 +212,6 @@ def test_a_merged_v2_loads_and_keeps_files_and_index(convert_v2, assets):
     for file in files:
         with safe_open(file, "pt") as opened:
             assert {index["weight_map"][key] for key in opened.keys()} == {file.name}  # noqa: SIM118
-    low, factors = torch.ones(1, 2), {"a A": torch.ones(1, 2), "a B": torch.full((2, 1), 3.0)}
-    assert torch.equal(merged("a", torch.zeros(2, 2), {"a": torch.ones(2, 2)}), torch.ones(2, 2))
-    assert torch.equal(merged("a", low.expand(2, 2), factors), torch.full((2, 2), 4.0))
 
 
 def test_what_is_missing_or_does_not_fit_v2_is_named(convert_v2, assets):
@@ -239,16 +230,7 @@ def test_what_is_missing_or_does_not_fit_v2_is_named(convert_v2, assets):
     refused(convert_v2(checkpoint="V2/depth/nothing"), assets, KEPT, "CHECKPOINT", "trainables.safetensors")
 
 
-def test_prompts_are_looked_for_beside_and_read_as_plain_data(convert_v2, assets):
-    prompts, elsewhere = assets / "V2" / "qwen_text_embeddings", assets / "elsewhere"
-    prompts.rename(elsewhere)
+def test_prompts_of_v2_are_looked_for_beside_the_checkpoint_or_named(convert_v2, assets):
+    (assets / "V2" / "qwen_text_embeddings").rename(assets / "elsewhere")
     refused(convert_v2(), assets, KEPT, "--with", "qwen_text_embeddings")
-    assert convert_v2("--with", elsewhere).code == 0
-    embeds = elsewhere / f"{reference.PREFIX}_prompt_embeds.pt"
-    for content, sentence in (
-        (torch.nn.Linear(2, 2), "would run code"),
-        ({"a": 1}, "holds a tensor"),
-    ):
-        torch.save(content, embeds)
-        with pytest.raises(ValueError, match=sentence):
-            read_prompt(elsewhere)
+    assert convert_v2("--with", assets / "elsewhere").code == 0

@@ -23,6 +23,7 @@ from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.frames import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
 from geodiff_plugin.pose.capture import SolvedCapture, candidate_pairs, solve_capture
+from tests.cli.conftest import call
 from tests.unit.capture_room import FLIP, HALF, SIZE, K, perturbed, render, walk, write_transforms
 
 COUNT = 10
@@ -87,8 +88,7 @@ def test_exact_poses_are_kept_bit_for_bit_and_given_ones_on_demand():
 
 
 @pytest.mark.parametrize(
-    ("form", "name"),
-    [(GIVEN @ FLIP, "OpenGL"), (np.linalg.inv(GIVEN), "world-to-camera")],
+    ("form", "name"), [(GIVEN @ FLIP, "OpenGL"), (np.linalg.inv(GIVEN), "world-to-camera")]
 )
 def test_other_conventions_are_found_by_the_residuals(form, name):
     found = solve(form)
@@ -148,10 +148,15 @@ def test_agreement_averages_within_the_error_marks_what_is_alone_and_outvotes_it
     np.testing.assert_allclose(agreed(wrong, []).depth, wrong.depth, rtol=1e-6)
 
 
-def test_the_cloud_lies_on_the_walls_and_its_normals_look_inside():
-    frames = {f"f{i}": agreed(depth_frame(i), [depth_frame(j) for j in (i - 1, i + 1)]) for i in (3, 5)}
-    images = {f"f{i}": render(TRUE[i])[0] / 255 for i in (3, 5)}
-    cloud, normals = fuse(list(frames), frames.__getitem__, images.__getitem__)
+@pytest.fixture(scope="module")
+def fused():
+    """Names of frames, their depth and images by name."""
+    frames = {f"f{i}": agreed(depth_frame(i), [depth_frame(i - 1)]) for i in (3, 5)}
+    return list(frames), frames.__getitem__, lambda name: render(TRUE[int(name[1:])])[0] / 255
+
+
+def test_the_cloud_lies_on_the_walls_and_its_normals_look_inside(fused):
+    cloud, normals = fuse(*fused)
     assert np.median(np.abs(np.abs(cloud.points_m) - HALF).min(1)) < 0.005
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
     assert ((normals * cloud.points_m).sum(1) < 0).mean() > 0.95
@@ -165,10 +170,8 @@ def test_maps_are_in_colmaps_bytes(tmp_path):
     np.testing.assert_array_equal(np.frombuffer(data, "<f4").reshape(2, 3, 4), values.transpose(2, 0, 1))
 
 
-def test_a_mesh_lies_on_the_walls_or_says_what_is_missing(tmp_path, monkeypatch):
-    frames = {f"f{i}": agreed(depth_frame(i), [depth_frame(i - 1)]) for i in (3, 5)}
-    images = {f"f{i}": render(TRUE[i])[0] / 255 for i in (3, 5)}
-    job = tmp_path / "mesh.ply", list(frames), frames.__getitem__, images.__getitem__
+def test_a_mesh_lies_on_the_walls_or_says_what_is_missing(fused, tmp_path, monkeypatch):
+    job = tmp_path / "mesh.ply", *fused
     with monkeypatch.context() as without, pytest.raises(InputError, match=r"geodiff-plugin\[mesh\]"):
         without.setitem(sys.modules, "open3d", None)
         write_mesh(*job)
@@ -250,16 +253,11 @@ def a_length() -> str:
     return f"f03:40,50,200,120,{np.linalg.norm(rays[1] - rays[0])}"
 
 
-@pytest.mark.parametrize(
-    "way",
-    [
-        {},
-        {"metres_per_unit": 2.0},
-        {"distance": f"f01,f08,{np.linalg.norm(TRUE[8, :3, 3] - TRUE[1, :3, 3])}"},
-        {"known_length": a_length()},
-    ],
-    ids=lambda way: next(iter(way), "none"),
-)
+WAYS = [{}, {"metres_per_unit": 2.0}, {"known_length": a_length()}]
+WAYS.append({"distance": f"f01,f08,{np.linalg.norm(TRUE[8, :3, 3] - TRUE[1, :3, 3])}"})
+
+
+@pytest.mark.parametrize("way", WAYS, ids=lambda way: next(iter(way), "none"))
 def test_one_length_gives_all_and_without_one_nothing_says_metres(way, model, tmp_path, monkeypatch, capsys):
     options = model(**way)
     report = run.capture_report(options)
@@ -312,36 +310,20 @@ def test_maps_of_another_model_take_the_prior_s_place(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_command_writes_every_frame_and_goes_on(tmp_path, capsys):
-    from geodiff_plugin.cli.app import main
-
-    source = write_transforms(tmp_path / "scan", TRUE, GIVEN)
+    source, out = write_transforms(tmp_path / "scan", TRUE, GIVEN), tmp_path / "out"
     options = ["--frames", "f03,f05", "-q", "--neighbours", "2", "--processes", "2", "--steps", "1"]
-    command = ["capture", str(source), "--out", str(tmp_path / "out"), *options, "--export", "colmap"]
-    with pytest.raises(SystemExit) as ended:
-        main(command)
-    assert not ended.value.code
-    out = tmp_path / "out"
-    truth = render(TRUE[3])[1]
+    command = ["capture", source, "--out", out, *options, "--export", "colmap"]
+    assert call(command) == 0
     depth = np.load(out / "f03" / "depth.npy")
-    assert depth.dtype == np.float32 and depth.shape == truth.shape
-    assert np.mean(np.abs(depth / truth - 1)) < 0.1
+    assert depth.dtype == np.float32 and np.mean(np.abs(depth / render(TRUE[3])[1] - 1)) < 0.1
     report = json.loads((out / "capture.json").read_text())
     assert report["poses"]["status"] == "solved" and report["unit"] == "m"
     assert report["agreement"]["f03"]["checked_against"] == 1
-    for name in (
-        "cloud.ply",
-        "cloud.glb",
-        "sheet.jpg",
-        "colmap/images/f03.png",
-        "colmap/stereo/depth_maps/f03.png.geometric.bin",
-        "colmap/sparse/points3D.txt",
-    ):
+    workspace = "images/f03.png stereo/depth_maps/f03.png.geometric.bin sparse/points3D.txt".split()
+    for name in ("cloud.ply", "cloud.glb", "sheet.jpg", *(f"colmap/{file}" for file in workspace)):
         assert (out / name).is_file()
     made = (out / "f03" / "depth_alone.npy").stat().st_mtime_ns
-    with pytest.raises(SystemExit):
-        main(command)
-    assert (out / "f03" / "depth_alone.npy").stat().st_mtime_ns == made
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as ended:
-        main([*command[:5], "f99", "-q"])
-    assert ended.value.code == 2 and "f99" in capsys.readouterr().err
+    assert call(command) == 0 and (out / "f03" / "depth_alone.npy").stat().st_mtime_ns == made
+    assert call([*command, "--overwrite"]) == 0
+    assert (out / "f03" / "depth_alone.npy").stat().st_mtime_ns > made
+    assert call([*command[:5], "f99", "-q"]) == 2 and "f99" in capsys.readouterr().err
