@@ -11,12 +11,14 @@ from PIL import Image
 
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.baselines.unguided import sgbm_shift
+from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample, make_sample
 from geodiff_plugin.evaluation.experiment import score
 from geodiff_plugin.formats import write_depth_mm, write_pfm
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.types import Rig
 from tests.contracts.tiny_transformers import MODELS, make_transformers
+from tests.evaluating import write_scenes
 
 SHAPE = (32, 48)
 
@@ -99,11 +101,10 @@ def test_no_gradient_goes_through_a_network_that_does_not_see_z_t(name, textured
 
 def slope() -> StereoSample:
     """A slope from 1 to 2.5 m; the right camera's principal point lies 2 px further (doffs)."""
-    image = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
-    K, doffs, E = np.array([[30.0, 0, 23.5], [0, 30.0, 15.5], [0, 0, 1]]), np.zeros((3, 3)), np.eye(4)
-    doffs[0, 2], E[0, 3] = 2.0, 0.2
-    depth_m = np.linspace(1.0, 2.5, SHAPE[1], dtype=np.float32)[None].repeat(SHAPE[0], 0)
-    return make_sample(SampleRef("folder", "mine", {}), (image, image), Rig(K, K + doffs, E), depth_m, {})
+    image, E = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), dtype=np.uint8), np.eye(4)
+    K, K_right = (np.array([[30.0, 0, cx], [0, 30.0, 15.5], [0, 0, 1]]) for cx in (23.5, 25.5))
+    E[0, 3], depth_m = 0.2, np.linspace(1.0, 2.5, SHAPE[1], dtype=np.float32)[None].repeat(SHAPE[0], 0)
+    return make_sample(SampleRef("folder", "mine", {}), (image, image), Rig(K, K_right, E), depth_m, {})
 
 
 def run(name, sample):
@@ -177,13 +178,9 @@ def test_depth_models_of_transformers_answer(tmp_path, kind, metric):
 
 
 @pytest.mark.parametrize("doffs", [0.0, 3.5])
-def test_sgbm_recovers_a_known_shift(doffs):
-    wide = np.random.default_rng(0).integers(0, 256, (48, 160, 3), dtype=np.uint8)
-    K, E = np.array([[100.0, 0, 70], [0, 100.0, 24], [0, 0, 1]]), np.eye(4)
-    rig, E[0, 3] = Rig(K, K + np.array([[0, 0, doffs], [0, 0, 0], [0, 0, 0]]), E), 0.1
-    truth = np.full((48, 144), 10.0 / (6 + doffs), np.float32)
-    views = wide[:, :144], wide[:, 6:150]  # x_left - x_right = 6
-    sample = make_sample(SampleRef("folder", "shift", {}), views, rig, truth, {})
+def test_sgbm_recovers_a_known_shift(tmp_path, doffs):
+    wall = load(find_pairs(write_scenes(tmp_path, "wall"))[0])
+    sample = replace(wall, K_right=wall.K_right + np.array([[0, 0, doffs], [0, 0, 0], [0, 0, 0]]))
     shift = sgbm_shift(sample)
-    assert np.isfinite(shift).mean() > 0.8 and np.nanmedian(shift) == pytest.approx(6 + doffs, abs=1 / 16)
-    assert np.median(np.abs(run("sgbm", sample).depth_m / truth - 1)) < 0.02
+    assert np.isfinite(shift).mean() > 0.8 and np.nanmedian(shift) == pytest.approx(8 + doffs, abs=1 / 16)
+    assert np.median(run("sgbm", sample).depth_m) == pytest.approx(10 / (8 + doffs), rel=0.02)

@@ -7,22 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from geodiff_plugin.evaluation.metrics import (
-    FLOOR_M,
-    MIN_DISPARITY,
-    align,
-    ause,
-    boundary_errors,
-    boundary_f1,
-    confidence_deciles,
-    counted,
-    edge_error,
-    evaluate_depth,
-    evaluate_disparity,
-    hidden_by_truth,
-    near_disparity_steps,
-    surface_error,
-)
+from geodiff_plugin.evaluation import metrics
 
 NAN = float("nan")
 
@@ -53,12 +38,7 @@ def test_depth_metrics_pixel_by_pixel(seed, cap):
     expected["silog"] = 100 * math.sqrt(max(squares - (sum(logs) / n) ** 2, 0.0))
     for k in (1, 2, 3):
         expected[f"delta{k}"] = sum(max(p / t, t / p) < 1.25**k for p, t in pairs) / n
-    assert evaluate_depth(pred, truth, valid, cap) == pytest.approx(expected, abs=1e-4)
-
-
-def test_a_map_of_holes_has_no_errors_but_a_coverage():
-    scores = evaluate_depth(np.full((2, 2), NAN), np.ones((2, 2)), np.ones((2, 2), bool))
-    assert scores["coverage"] == 0 and math.isnan(scores["abs_rel"])
+    assert metrics.evaluate_depth(pred, truth, valid, cap) == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.parametrize("step_px", [0.0, 1.5, 4.0])
@@ -68,8 +48,8 @@ def test_disparity_metrics_pixel_by_pixel(step_px):
     expected = {"epe": 8 / 3, "bad1": 2 / 3, "bad2": 2 / 3, "bad3": 2 / 3, "d1": 1 / 3}  # 4 of 100 are no 5 %
     coarse = {name for name, least in (("bad1", 1), ("bad2", 2), ("bad3", 3), ("d1", 3)) if step_px > least}
     expected |= dict.fromkeys(coarse)
-    assert evaluate_disparity(pred, truth, valid, step_px) == pytest.approx(expected)
-    assert math.isnan(evaluate_disparity(np.full((1, 5), NAN), truth, valid, step_px)["epe"])
+    assert metrics.evaluate_disparity(pred, truth, valid, step_px) == pytest.approx(expected)
+    assert math.isnan(metrics.evaluate_disparity(np.full((1, 5), NAN), truth, valid, step_px)["epe"])
 
 
 @given(seed=st.integers(0, 200), steps=st.integers(1, 30))
@@ -89,13 +69,13 @@ def test_ause_pixel_by_pixel(seed, steps):
     expected = np.mean(curve(lambda e: e[1]) - best)
     orders = ((sigma, expected), (7 * sigma, expected), (None, mean - best.mean()))
     for uncertainty, area in orders:
-        assert ause(pred, truth, valid, uncertainty, steps) == pytest.approx(area, abs=1e-9)
+        assert metrics.ause(pred, truth, valid, uncertainty, steps) == pytest.approx(area, abs=1e-9)
 
 
 def test_confidence_deciles_closed_form():
     truth, valid = np.full((1, 4), 2.0), np.array([[True, True, True, False]])
     pred = np.array([[2.0, 2.1, 3.0, 9.0]])
-    classes = confidence_deciles(pred, truth, valid, np.array([[0.95, 1.0, 0.25, 0.25]]), within=0.1)
+    classes = metrics.confidence_deciles(pred, truth, valid, np.array([[0.95, 1.0, 0.25, 0.25]]), within=0.1)
     assert [decile["share"] for decile in classes] == pytest.approx([0, 0, 1 / 3, 0, 0, 0, 0, 0, 0, 2 / 3])
     assert classes[9] == pytest.approx({"share": 2 / 3, "promised": 0.975, "kept": 1.0, "abs_rel": 0.025})
     assert classes[2]["kept"] == 0.0 and classes[2]["abs_rel"] == pytest.approx(0.5)
@@ -110,25 +90,25 @@ def test_alignment_is_exact_where_the_prediction_is_affine_in_its_space(space, s
     in_space |= {"log": np.log(truth), "log1p": np.log(truth + 1)}
     values, valid = scale * in_space[space] + 9.0, truth > 2
     values[~valid] = 1e3  # is no part of the fit
-    np.testing.assert_allclose(align(values, truth, valid, space)[valid], truth[valid], rtol=1e-8)
+    np.testing.assert_allclose(metrics.align(values, truth, valid, space)[valid], truth[valid], rtol=1e-8)
 
 
 def test_alignment_clips_what_lies_behind_the_camera_or_too_far_and_keeps_holes():
     truth, values = np.array([[1.0, 2.0, 4.0]]), np.array([[1.0, 0.5, -5.0]])
-    aligned = align(values, truth, np.ones((1, 3), bool), "disparity")  # the last is no part of the fit
-    np.testing.assert_allclose(aligned, [[1.0, 2.0, 1 / MIN_DISPARITY]])
-    behind = align(np.array([[1.0, 2.0, -4.0]]), truth, np.array([[True, True, False]]))
-    assert behind[0, 2] == FLOOR_M
+    aligned = metrics.align(values, truth, truth > 0, "disparity")  # the last is no part of the fit
+    np.testing.assert_allclose(aligned, [[1.0, 2.0, 1 / metrics.MIN_DISPARITY]])
+    behind = metrics.align(np.array([[1.0, 2.0, -4.0]]), truth, np.array([[True, True, False]]))
+    assert behind[0, 2] == metrics.FLOOR_M
     for space, hole in (("depth", NAN), ("disparity", 0.0)):
-        assert np.isnan(align(np.full((1, 3), hole), truth, truth > 0, space)).all()
+        assert np.isnan(metrics.align(np.full((1, 3), hole), truth, truth > 0, space)).all()
 
 
 def test_no_truth_and_no_uncertainty_are_refused():
     one = np.ones((1, 1))
     with pytest.raises(ValueError, match="no valid pixel"):
-        counted(np.array([[100.0, 0.0]]), np.ones((1, 2), bool), 80.0)
+        metrics.counted(np.array([[100.0, 0.0]]), np.ones((1, 2), bool), 80.0)
     with pytest.raises(ValueError, match="uncertainty must be finite"):
-        ause(NAN * one, one, one > 0, one)
+        metrics.ause(NAN * one, one, one > 0, one)
 
 
 def steps(seed, size=(17, 23)):
@@ -139,29 +119,22 @@ def steps(seed, size=(17, 23)):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_near_a_step_is_within_four_pixels_of_known_neighbours_apart(seed):
+def test_steps_reach_four_pixels_and_hide_what_something_nearer_covers(seed):
     truth, _, valid = steps(seed)
     apart = []
     for (r, c), d in np.ndenumerate(truth):
         for q in ((r, c + 1), (r + 1, c)):
             if q[0] < truth.shape[0] and q[1] < truth.shape[1] and valid[r, c] and valid[q]:
                 apart += [(r, c), q] if abs(truth[q] - d) > 3 else []
-    expected = np.zeros(truth.shape, bool)
-    for r, c in np.ndindex(truth.shape):
-        expected[r, c] = valid[r, c] and any(np.hypot(r - y, c - x) <= 4 for y, x in apart)
-    np.testing.assert_array_equal(near_disparity_steps(truth, valid), expected)
-    assert not near_disparity_steps(np.full((5, 6), 9.0), np.ones((5, 6), bool)).any()
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_hidden_is_what_something_nearer_covers(seed):
-    truth, _, valid = steps(seed)
-    expected = np.zeros(truth.shape, bool)
+    near, hidden = np.zeros(truth.shape, bool), np.zeros(truth.shape, bool)
     for r, c in zip(*np.nonzero(valid), strict=True):
+        near[r, c] = any(np.hypot(r - y, c - x) <= 4 for y, x in apart)
         column = round(c - truth[r, c])
         others = [truth[r, k] for k in np.flatnonzero(valid[r]) if round(k - truth[r, k]) == column]
-        expected[r, c] = 0 <= column < truth.shape[1] and max(others) > truth[r, c] + 1
-    np.testing.assert_array_equal(hidden_by_truth(truth, valid), expected)
+        hidden[r, c] = 0 <= column < truth.shape[1] and max(others) > truth[r, c] + 1
+    np.testing.assert_array_equal(metrics.near_disparity_steps(truth, valid), near)
+    np.testing.assert_array_equal(metrics.hidden_by_truth(truth, valid), hidden)
+    assert not metrics.near_disparity_steps(np.full((5, 6), 9.0), np.ones((5, 6), bool)).any()
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -183,23 +156,24 @@ def test_boundary_f1_by_direction_and_threshold(seed):
             recall, precision = recall + hits / max(true, 1) / 4, precision + hits / max(drawn, 1) / 4
         total += t * 2 * recall * precision / (recall + precision) if recall + precision else 0
         weights += t
-    assert boundary_f1(pred, truth, valid) == pytest.approx(total / weights)
-    assert boundary_f1(7.0 * pred, truth, valid) == pytest.approx(total / weights)
-    assert np.isnan(boundary_f1(pred, np.ones_like(truth), valid))
+    assert metrics.boundary_f1(pred, truth, valid) == pytest.approx(total / weights)
+    assert metrics.boundary_f1(7.0 * pred, truth, valid) == pytest.approx(total / weights)
+    assert np.isnan(metrics.boundary_f1(pred, np.ones_like(truth), valid))
 
 
 @pytest.mark.parametrize("moved", [0, 3, 6])
 def test_boundary_errors_are_distances_of_parallel_edges(moved):
     truth, pred = (np.where(np.arange(60)[None] < c, 2.0, 7.0).repeat(40, 0) for c in (30, 30 + moved))
-    errors = boundary_errors(3.0 * pred, truth, np.ones(truth.shape, bool))
+    errors = metrics.boundary_errors(3.0 * pred, truth, np.ones(truth.shape, bool))
     assert errors == pytest.approx({"dbe_acc": moved, "dbe_comp": moved}, abs=0.2)
 
 
 def test_errors_at_edges_and_of_surfaces():
     truth, shifted = (np.where(np.arange(60)[None] < c, 2.0, 4.0).repeat(40, 0) for c in (30, 32))
     valid = np.ones(truth.shape, bool)
-    assert edge_error(truth, truth, valid) == surface_error(truth, truth, valid) == 0.0
-    assert edge_error(shifted, truth, valid) > 0.1 and surface_error(shifted, truth, valid) == 0.0
+    assert metrics.edge_error(truth, truth, valid) == metrics.surface_error(truth, truth, valid) == 0.0
+    assert metrics.edge_error(shifted, truth, valid) > 0.1
+    assert metrics.surface_error(shifted, truth, valid) == 0.0
     rough = truth * np.exp(0.01 * np.random.default_rng(0).normal(size=truth.shape))
-    assert surface_error(rough, truth, valid) > 5.0
-    assert np.isnan(edge_error(truth, np.full(truth.shape, 2.0), valid))
+    assert metrics.surface_error(rough, truth, valid) > 5.0
+    assert np.isnan(metrics.edge_error(truth, np.full(truth.shape, 2.0), valid))
