@@ -47,9 +47,7 @@ def check_intrinsics(K: Any, name: str = "K") -> np.ndarray:
     return K
 
 
-def check_intrinsics_fit(
-    K: np.ndarray, width: int, height: int, name: str = "K", image: str = "the image"
-) -> None:
+def check_intrinsics_fit(K: np.ndarray, width: int, height: int, name: str, image: str) -> None:
     """Refuse a camera matrix whose principal point lies outside the image that it comes with."""
     cx, cy = K[0, 2], K[1, 2]
     if not (0 <= cx <= width and 0 <= cy <= height):

@@ -9,7 +9,6 @@ from contextvars import ContextVar
 from numbers import Integral, Real
 from typing import Any, NoReturn
 
-#: The most characters of the given value that a message quotes; it may be a whole file.
 LONGEST_GOT = 400
 #: What ``warn`` says goes to the innermost ``noted`` block too.
 _NOTED: ContextVar[dict[str, bool] | None] = ContextVar("noted", default=None)

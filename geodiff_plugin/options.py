@@ -17,12 +17,10 @@ from geodiff_plugin._checks import bad_value, check_choice, check_number, check_
 if TYPE_CHECKING:
     from geodiff_plugin.config import GuidanceConfig
 
-#: Headings of the help.
 CAMERAS, RUN, OUTPUT = "Cameras", "Prior and run", "Output"
 DTYPES = ("float32", "float16", "bfloat16")
 #: Keys of ``scale.space.SPACES``, which cannot be imported without torch; a test keeps them the same.
 SPACES = ("depth", "disparity", "log", "log1p", "sqrt_disparity")
-#: The presets that two views suffice for.
 PRESETS = ("default", "fast", "paper")
 
 
@@ -82,13 +80,9 @@ class PriorOptions:
 
     prior: str = declare("bundled", "'bundled', a hub id or a folder; KEY:folder says which kind.")
     space: str | None = declare(
-        None,
-        "Space in which the prior's map is affine, if its folder does not say: depth, disparity ...",
-        choices=SPACES,
+        None, "Space of the prior's map, unless its folder says: depth ...", choices=SPACES
     )
-    steps: int | None = declare(
-        None, "Denoising steps; by default the prior's own, at least 4.", low=1, high=1000
-    )
+    steps: int | None = declare(None, "Denoising steps; default: the prior's, at least 4.", low=1, high=1000)
     seed: int = declare(0, "Seed of the noise.", low=0, high=2**63 - 1)
     device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
 
@@ -98,23 +92,19 @@ class RunOptions(PriorOptions):
     """How it runs: what ``geodiff depth``, the page and the ComfyUI node have in common."""
 
     option: tuple[str, ...] = declare(
-        (), "An option that only this prior has, as NAME=VALUE (GeoWizard: domain=outdoor)."
+        (), "An option of the prior, as NAME=VALUE (GeoWizard: domain=outdoor)."
     )
     ensemble: int = declare(
-        1, "Number of members; with 2 or more, their spread is written as uncertainty.", low=1, high=1000
+        1, "Number of members; the spread of 2 or more is the uncertainty.", low=1, high=1000
     )
-    resolution: int | None = declare(
-        None, "Longer side at which the prior works, pixels; 0: the image's own.", low=0, high=8192
-    )
+    resolution: int | None = declare(None, "Longer side for the prior, px; 0: the image's.", low=0, high=8192)
     near: float | None = declare(None, "Nearest depth to search, metres.", above_0="metres")
     far: float | None = declare(None, "Farthest depth to search, metres.", above_0="metres")
     dtype: str = declare("float32", "float32, float16 or bfloat16.", choices=DTYPES)
     preset: str = declare(
         "default", "default, fast (coarser matches, poses as given), or paper (Algorithm 1).", choices=PRESETS
     )
-    knob: tuple[str, ...] = declare(
-        (), "A knob of the guidance (geodiff info --knobs), as inner_steps=0; repeatable."
-    )
+    knob: tuple[str, ...] = declare((), "A knob (geodiff info --knobs), as inner_steps=0; repeatable.")
 
     def check(self, name_of: Callable[[Field[Any]], str] = flag_of) -> None:
         """Everything that can be said before a file is opened or torch is imported."""

@@ -40,12 +40,7 @@ except ImportError:  # Windows: two processes may do the same work twice
 Record = dict[str, Any]
 Stage = Callable[[Any], Any]
 
-#: ``status`` of an item that failed.
-BROKEN = "broken"
-#: Seconds between two looks at what other processes have finished.
-POLL_S = 0.2
-#: Names that a sentence about several failures gives.
-MOST_NAMES = 5
+BROKEN, MOST_NAMES, POLL_S = "broken", 5, 0.2
 
 
 def fingerprint(*parts: Any) -> str:

@@ -27,22 +27,17 @@ from geodiff_plugin.formats.sfm import (
 from geodiff_plugin.types import Distortion
 
 IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
-#: Factory intrinsics that the data sets publish for files without their own.
 SEVEN_SCENES = Camera(intrinsics(525.0, 525.0, 320.0, 240.0), (640, 480))
 TUM_RGBD = Camera(intrinsics(525.0, 525.0, 319.5, 239.5), (640, 480))
-#: What data sets with a pose a file call their images, poses and depth maps, and their intrinsics.
+#: What data sets with a pose a file call their images, poses and depth maps, and their published intrinsics.
 TRACKED = {
     "7-Scenes": ("frame-*.color.*", "{}.pose.txt", "{}.depth.png", SEVEN_SCENES),
     "ScanNet": ("color/*", "pose/{}.txt", "depth/{}.png", None),
 }
-#: Files of intrinsics in the folder of such a data set, or above it.
-INTRINSICS = (
-    *("intrinsics.txt", "camera-intrinsics.txt", "K.txt"),
-    *("intrinsic/intrinsic_color.txt", "intrinsic_color.txt"),
-)
+INTRINSICS = "intrinsics.txt camera-intrinsics.txt K.txt intrinsic/intrinsic_color.txt intrinsic_color.txt"
 #: Values a metre of TUM's depth maps, others are in millimetres.
 TUM_DEPTH = 5000.0
-#: Entries of a frame by which a transforms.json says that its poses come from structure from motion.
+#: With these entries the poses of a transforms.json come from structure from motion.
 OF_COLMAP = ("colmap_im_id", "sharpness")
 #: Poses of a trajectory further from an image than this, in seconds, are not its own.
 FARTHEST_S = 0.05
@@ -141,7 +136,7 @@ def _finished(
 
 def _file_camera(folder: Path, published: Camera | None) -> Camera | None:
     """The intrinsics that a data set has as a file, else its published ones."""
-    files = [parent / name for parent in (folder, folder.parent) for name in INTRINSICS]
+    files = [parent / name for parent in (folder, folder.parent) for name in INTRINSICS.split()]
     file = next((file for file in files if file.is_file()), None)
     return published if file is None else Camera(read_matrix(file, f"{file}")[:3, :3])
 

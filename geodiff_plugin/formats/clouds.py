@@ -26,10 +26,8 @@ FEWEST_NEIGHBOURS = 3
 MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 COMPONENTS = {"f": 5126, "B": 5121, "I": 5125}
 ATTRIBUTES, INDICES, POINTS, LINES = 34962, 34963, 0, 1
-#: A camera's pyramid is drawn to this share of the cloud's median depth.
-PYRAMID_SHARE = 0.08
+PYRAMID_SHARE = 0.08  # of the cloud's median depth
 CAMERA_COLOURS = ((255, 255, 255), (255, 170, 0), (0, 200, 255), (160, 255, 120))
-#: Centre to the four corners, and around them.
 EDGES = np.array([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1], dtype=np.uint32)
 
 
@@ -203,9 +201,8 @@ def write_glb(
         "accessors": accessors,
     }
     scene = {name: value for name, value in scene.items() if value != []}  # glTF knows no empty lists
-    # Each chunk is padded to 4 bytes: JSON with blanks, binary with zeros.
     text = json.dumps(scene, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
+    text += b" " * (-len(text) % 4)  # as every chunk
     chunks = struct.pack("<II", len(text), JSON_CHUNK) + text
     chunks += struct.pack("<II", len(data), BINARY_CHUNK) + data if data else b""
     with atomic_path(path) as temporary:

@@ -24,14 +24,11 @@ PathLike = str | os.PathLike[str]
 LARGEST_MM, MILLIMETRES, KITTI_UNITS = 65535, 1000.0, 256.0
 #: Pixels of a strip: a map of float64 of so many is 8 MB.
 STRIP_PIXELS = 1 << 20
-#: What depth models are read from.
 MAP_FILES = "a map (H, W) as .npy, .npz, .pfm or 16-bit .png"
 KINDS = (
-    "a 16-bit PNG (millimetres), a PFM or .npy map in metres, or points in metres as .npy, text, .ply or "
-    "KITTI's .bin"
+    "a 16-bit PNG (millimetres), a .pfm or .npy map, or points as .npy, text, .ply or KITTI's .bin, in metres"
 )
-#: Columns of points: x y z, with an intensity, or with a colour.
-COLUMNS = (3, 4, 6)
+COLUMNS = (3, 4, 6)  # x y z, with an intensity, or with a colour
 NUMBER = re.compile(r"[-+]?(\d.*|\..*|nan|inf)", re.IGNORECASE)
 PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -39,14 +36,11 @@ PLY_TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-#: The head of a PLY file without its comments: order, number and plain properties of the first element.
 PLY_HEAD = re.compile(
     rf"ply\s+format ({'|'.join(PLY_ORDERS)}) \S+\s+element vertex (\d{{1,12}})\s+"
     rf"((?:property (?:{'|'.join(PLY_TYPES)}) \w+\s+)+)(?:element|end_header)"
 )
-#: A row of KITTI's calibrations, which readers of cameras use too.
 KITTI_ROW = re.compile(r"^\s*(\w+)\s*:(.*)$", re.MULTILINE)
-#: A head is text; none is near this size.
 LONGEST_HEAD = 65_536
 VELODYNE = "KITTI's calib/N.txt, or calib_velo_to_cam.txt together with calib_cam_to_cam.txt"
 
@@ -70,9 +64,7 @@ def read_pfm(path: PathLike, name: str = "map") -> np.ndarray:
             kind, width, height, scale = b"", 0, 0, 0.0
         data = stream.read()
     if kind != b"Pf" or min(width, height) < 1 or len(data) < 4 * width * height:
-        bad_value(
-            name, "a whole grey PFM file (Pf, size, scale, data)", file, "Is it cut off, or a PNG or npy?"
-        )
+        bad_value(name, "a whole grey PFM file (Pf, size, scale)", file, "Is it cut off, or a PNG or npy?")
     values = np.frombuffer(data, dtype="<f4" if scale < 0 else ">f4", count=width * height)
     return np.flipud(values.reshape(height, width)).astype(np.float32)
 
@@ -314,8 +306,7 @@ def depth_of_disparity(
 ) -> np.ndarray:
     """Depths ``(H, W)``, metres, ``fx baseline / (d + doffs)``, of a disparity map; 0 where unknown.
 
-    The map may be one of the image scaled: its disparities grow with its width, and every pixel takes the
-    nearest. A PNG holds 256 units a pixel, as KITTI's. ``rig`` is rectified, its K for images of ``size``.
+    The map may be one of the image scaled; ``rig`` is rectified, its K for images of ``size``.
     """
     baseline_m = _baseline(rig.E, name, f"the rig of {rig.source}")
     if rig.unit is None:

@@ -26,7 +26,6 @@ ORIENTATION = 0x0112
 DECIMAL_COMMA = re.compile(r"(?<![^\s;])[-+]?\d+,\d+(e[-+]?\d+)?(?![^\s;])", re.IGNORECASE)
 #: No calibration file is near this size; a larger one is something else.
 LARGEST_TEXT_BYTES = 16_000_000
-#: Shape of a matrix that is written in one row, by the count of its numbers.
 FLAT = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
 MATRIX = "a 3x3 K or a 4x4 (or 3x4) E, as text of numbers or .npy"
 
@@ -49,9 +48,7 @@ def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") ->
     return file
 
 
-#: Suffixes of depth maps, in the order in which ``find_map`` looks for them.
 MAP_SUFFIXES = (".npy", ".npz", ".pfm", ".png")
-#: What Pillow raises at a damaged file.
 DECODE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, KeyError, EOFError, zlib.error)
 
 
@@ -172,11 +169,9 @@ def read_matrix(path: str | os.PathLike[str], name: str = "matrix") -> np.ndarra
     if file.suffix.lower() == ".npy":
         matrix = read_npy(file, name, MATRIX).astype(np.float64)
     else:
-        rows = [
-            " ".join(row).strip("[]() ") for row in read_rows(file, name, MATRIX)
-        ]  # as Python and JSON too
+        rows = [re.sub(r"[\[\]()]", " ", " ".join(row)).split() for row in read_rows(file, name, MATRIX)]
         try:
-            matrix = np.array([re.split(r"[\[\]() ]+", row) for row in rows if row], dtype=np.float64)
+            matrix = np.array([row for row in rows if row], dtype=np.float64)
         except ValueError:
             cure = "Is it cut off? A calibration file with words goes to --calib."
             bad_value(name, MATRIX, f"{path} with words in it, or rows of several lengths", cure)

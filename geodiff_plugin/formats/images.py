@@ -21,15 +21,12 @@ from geodiff_plugin.types import Distortion
 MIN_SIDE = 32
 #: Resampling may overshoot [0, 1] by a little; more than this is another range.
 OVERSHOOT = 1e-3
-#: EXIF's orientations of an image that is to be turned or mirrored.
-TURNS = range(2, 9)
 #: 16-bit values that all lie below this are those of a camera of 10 or 12 bits, as they come.
 DARK_16_BITS = 8192
-CHANNELS = (1, 3, 4)
 #: Formats that hold several frames or pages of one kind; others hold previews.
 SEVERAL = ("GIF", "PNG", "TIFF", "WEBP")
+TURNS, CHANNELS = range(2, 9), (1, 3, 4)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-#: Diagonal of a 35 mm frame, which equivalent focal lengths are compared by.
 _DIAGONAL_35_MM = math.hypot(36.0, 24.0)
 #: A focal length further off its EXIF than this factor is of an image of another size: EXIF is known to a few
 #: per cent, and rectification or a lens that was straightened changes it by less.
@@ -111,9 +108,7 @@ def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.nda
     image_01, more = _to_01(_array_of(upright, name), name)
     notes += more
     if is_turned:
-        said = (
-            f"{name} was turned or mirrored to {upright.width}x{upright.height}, as its EXIF orientation says"
-        )
+        said = f"{name} was turned or mirrored to {upright.width}x{upright.height}, as its EXIF says"
         notes.append(f"{said}; K must belong to the turned image.")
     return image_01, notes
 

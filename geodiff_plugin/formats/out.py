@@ -21,11 +21,8 @@ try:
 except ImportError:  # Windows: two runs with one folder are not detected
     fcntl = None  # type: ignore[assignment]
 
-#: The hidden folder of a run that is under way, with its lock and its files.
 PARTIAL, LOCK, FILES = ".geodiff-partial", "lock", "files"
-#: Lists what a run wrote, and is written last.
 REPORT = "report.json"
-#: A disk with less room takes no result.
 LEAST_FREE_BYTES = 8 << 20
 
 Result = TypeVar("Result")

@@ -15,7 +15,6 @@ from geodiff_plugin.formats import sfm, stereo
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
 from geodiff_plugin.types import Rig
 
-#: How a text of JSON begins.
 _JSON = r"\A\s*[{\[]"
 #: Every format by name. The first that recognises a file reads it: formats that others contain come first.
 CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
@@ -92,12 +91,8 @@ def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
         counts = " or ".join(map(str, entry.file_counts))
         twice = "Give --calib twice, for the left and the right view."
         cure = twice if len(texts) == 1 else "A file of both cameras is given once."
-        bad_value(
-            "calibration",
-            f"as many files as {entry.summary} has: {counts}",
-            " and ".join(map(str, texts)),
-            cure,
-        )
+        expected = f"as many files as {entry.summary} has: {counts}"
+        bad_value("calibration", expected, " and ".join(map(str, texts)), cure)
     return entry
 
 
@@ -159,10 +154,7 @@ def read_calibration(
         rig = replace(entry.read(tuple(texts.values()), choice), source=source)
     for side, lens in zip(("left", "right"), rig.distortion, strict=True):
         if lens is not None and not distorted:
-            cure = (
-                "Undistort or rectify both images first and give the calibration of the result (P1, P2), or "
-            )
-            cure += "use geodiff depth, which undistorts them."
+            cure = "Undistort or rectify both images and give P1 and P2 of the result, or use geodiff depth."
             got = f"{lens.model} {np.array2string(lens.coefficients, precision=4, separator=', ')}"
             name = f"Lens distortion of the {side} camera in {source}"
             bad_value(name, "zero (images of a pinhole camera)", got, cure)

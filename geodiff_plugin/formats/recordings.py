@@ -20,16 +20,13 @@ from geodiff_plugin._checks import InputError, InputFileError, bad_value, refuse
 from geodiff_plugin.formats.depth import depth_mm
 from geodiff_plugin.formats.files import check_file
 
-#: Suffixes of videos, and of bags that can be written: one MCAP file of ROS 2, or a bag of ROS 1.
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 BAG_SUFFIXES = (".mcap", ".bag")
 #: Encoding of a raw image -> type of its numbers, channels, and what makes RGB of it. OpenCV names Bayer
 #: patterns by the second row, ROS by the first.
 ENCODINGS: dict[str, tuple[str, int, int | None]] = {
-    "rgb8": ("u1", 3, None),
-    "bgr8": ("u1", 3, cv2.COLOR_BGR2RGB),
-    "rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB),
-    "bgra8": ("u1", 4, cv2.COLOR_BGRA2RGB),
+    **{"rgb8": ("u1", 3, None), "bgr8": ("u1", 3, cv2.COLOR_BGR2RGB)},
+    **{"rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB), "bgra8": ("u1", 4, cv2.COLOR_BGRA2RGB)},
 }
 for _bits in (8, 16):
     for _name, _opencv in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB")):
@@ -218,14 +215,11 @@ def stereo_calibration(path: Path, topics: tuple[str, str]) -> tuple[list[str], 
                 cure = "Give --calib, or the cameras in another way."
                 bad_value("calibration", f"in the bag as {base}/camera_info, or given", "neither", cure)
             info = reader.deserialize(first[2], first[0].msgtype)
-            entries: dict[str, Any] = {
-                "width": info.width,
-                "height": info.height,
-                "rectified": "rect" in name,
-            }
+            entries: dict[str, Any] = {"width": info.width, "height": info.height}
+            entries |= {"distortion_model": info.distortion_model, "rectified": "rect" in name}
             for key in "DKRP":  # ROS 2 has them in small letters
                 entries[key] = np.array(getattr(info, key, getattr(info, key.lower(), ())), float).tolist()
-            texts.append(yaml.safe_dump(entries | {"distortion_model": info.distortion_model}))
+            texts.append(yaml.safe_dump(entries))
             frames.append(info.header.frame_id)
     return texts, frames[0]
 

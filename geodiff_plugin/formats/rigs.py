@@ -33,7 +33,6 @@ LENS_MODELS = {
     **dict.fromkeys("fisheye opencv_fisheye equidistant kannalabrandt4 kannalabrandt8".split(), "fisheye"),
 }
 COEFFICIENT_COUNTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
-#: What readers raise on a file that is not whole.
 UNFINISHED = (
     *(LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError),
     *(yaml.YAMLError, configparser.Error, ElementTree.ParseError),
@@ -245,15 +244,12 @@ def make_rig(left: Camera, right: Camera, pose: Any, *, rectified: bool = False)
     else:
         E = array_of(pose, (4, 4), "the pose")
     cameras = (("the left camera", left), ("the right camera", right))
-    K_left, K_right = (
-        check_intrinsics(array_of(camera.K, (3, 3), f"K of {name}"), f"K of {name}")
-        for name, camera in cameras
-    )
+    Ks = [check_intrinsics(array_of(c.K, (3, 3), f"K of {name}"), f"K of {name}") for name, c in cameras]
     sizes = [_pixels(camera.size, name) for name, camera in cameras]
     left_lens, right_lens = (lens_of(camera, name) for name, camera in cameras)
     rectified = rectified and left_lens is right_lens is None
     lenses = (left_lens, right_lens)
-    return Rig(K_left, K_right, E, sizes[0], sizes[1], distortion=lenses, rectified=rectified)
+    return Rig(Ks[0], Ks[1], E, sizes[0], sizes[1], distortion=lenses, rectified=rectified)
 
 
 def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any = None) -> Rig:
@@ -285,7 +281,6 @@ def rig_from_parameters(
     """
     for name, value, unit in (("fx", fx, "pixels"), ("fy", fy, "pixels"), ("baseline", baseline_m, "metres")):
         check_positive(value, name, unit)
-    left, right = (
-        Camera(intrinsics(fx, fy, x, cy), size) for x in (cx, cx if cx_right is None else cx_right)
-    )
+    columns = (cx, cx if cx_right is None else cx_right)
+    left, right = (Camera(intrinsics(fx, fy, x, cy), size) for x in columns)
     return make_rig(left, right, baseline_m)

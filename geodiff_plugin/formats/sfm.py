@@ -34,22 +34,14 @@ from geodiff_plugin.types import Rig
 #: Of a model, in the order of its numbers in binary files: how many focal lengths stand before cx cy, its
 #: lens as ``Camera.model``, how many coefficients stand behind. Those that OpenCV has more are 0.
 MODELS = {
-    "SIMPLE_PINHOLE": (1, "opencv", 0),
-    "PINHOLE": (2, "opencv", 0),
-    "SIMPLE_RADIAL": (1, "opencv", 1),
-    "RADIAL": (1, "opencv", 2),
-    "OPENCV": (2, "opencv", 4),
-    "OPENCV_FISHEYE": (2, "fisheye", 4),
-    "FULL_OPENCV": (2, "opencv", 8),
-    "FOV": (2, "FOV", 1),
-    "SIMPLE_RADIAL_FISHEYE": (1, "fisheye", 1),
-    "RADIAL_FISHEYE": (1, "fisheye", 2),
-    "THIN_PRISM_FISHEYE": (2, "THIN_PRISM_FISHEYE", 8),
+    **{"SIMPLE_PINHOLE": (1, "opencv", 0), "PINHOLE": (2, "opencv", 0), "SIMPLE_RADIAL": (1, "opencv", 1)},
+    **{"RADIAL": (1, "opencv", 2), "OPENCV": (2, "opencv", 4), "OPENCV_FISHEYE": (2, "fisheye", 4)},
+    **{"FULL_OPENCV": (2, "opencv", 8), "FOV": (2, "FOV", 1), "SIMPLE_RADIAL_FISHEYE": (1, "fisheye", 1)},
+    **{"RADIAL_FISHEYE": (1, "fisheye", 2), "THIN_PRISM_FISHEYE": (2, "THIN_PRISM_FISHEYE", 8)},
 }
 CAMERA = re.compile(r"^(\d+) ([A-Z_]+) (\d+) (\d+) (.+)$", re.MULTILINE)
 IMAGE = re.compile(r"^(\d+)((?: [-+.\deE]+){7}) (\d+) (\S.*)$", re.MULTILINE)
 CAMERAS_MARK, IMAGES_MARK = "# Camera list with", "# Image list with"
-#: What a text of a model's cameras or images has.
 MARK = rf"{CAMERAS_MARK}|{IMAGES_MARK}|^\d+ (?:{'|'.join(MODELS)}) \d+ \d+ .|{IMAGE.pattern}"
 LONGEST_HEAD = 200
 #: Of an image: its number, ``(4, 4)`` T_camera_from_world, its camera's number.
@@ -196,7 +188,6 @@ NERF_LENSES = {
     "opencv": (("k1", "k2", "p1", "p2", "k3"), ("k4",)),
     "fisheye": (("k1", "k2", "k3", "k4"), ("p1", "p2")),
 }
-#: The order of nerfstudio's ``distortion_params``.
 NERF_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 Frame = dict[str, Any]
 

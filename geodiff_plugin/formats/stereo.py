@@ -38,11 +38,9 @@ ENTRY = re.compile(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*?)[ \t]*$", re.MULTILINE)
 #: Files are printed with three decimals, so an honest cam1 agrees with doffs better than this.
 DOFFS_TOLERANCE_PX = 0.05
 PROJECTION = re.compile(r"(P_rect_|P)(\d+)")
-#: KITTI's grey pair and colour pair.
 PAIRS = ((0, 1), (2, 3))
 #: Folder names of the benchmarks: image_2 and image_02, and colored_0 of KITTI 2012.
 FOLDER = re.compile(r"(image|colored)_0?([0-3])(?!\d)")
-#: Width and height of the images that a ZED's section is for.
 ZED_SIZES = {
     **{"4K": (3840, 2160), "QHDPLUS": (3200, 1800), "2K": (2208, 1242), "FHD1200": (1920, 1200)},
     **{"FHD": (1920, 1080), "HD": (1280, 720), "SVGA": (960, 600), "VGA": (672, 376)},
@@ -270,7 +268,6 @@ def read_oak(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 
 #: OpenCV's head of a YAML file, which YAML itself does not know; files written by hand copy it.
 OPENCV_HEAD = re.compile(r"\A\s*%YAML:[^\n]*")
-#: Which coefficients a lens has, by ORB-SLAM's ``Camera.type``.
 ORB_LENSES = {"PinHole": ("k1", "k2", "p1", "p2", "k3"), "KannalaBrandt8": ("k1", "k2", "k3", "k4")}
 #: The right camera's pose in the left one's frame, in settings of version 1.0 and in older ones.
 ORB_POSES = ("Stereo.T_c1_c2", "Tlr")
@@ -424,7 +421,6 @@ def _of(words: str, number: str, side: str) -> str:
     return f"(?:{words})(?:{number}|{side[0]}|{side})|{side}(?:{words})"
 
 
-#: What a matrix of one camera is called.
 WORDS = {
     "M": "m|k|mtx|cameramatrix|intrinsics?|intrinsicmatrix",
     "D": "d|dis|dist|distcoeffs?|distcoefs?|distort|distortion|distortioncoefficients|distortioncoeffs",
