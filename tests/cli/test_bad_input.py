@@ -45,9 +45,6 @@ FILES: dict[str, Any] = {
     "E.txt": E,
     "E-transposed.txt": E.T,
     "E-still.txt": np.eye(4),
-    "cut.json": '{"fx": 700, "fy": 7',
-    "entities.xml": '<!DOCTYPE x [<!ENTITY a "b">]><opencv_storage></opencv_storage>',
-    "other-images.json": NERF.replace("left", "elsewhere"),
     "large.json": NERF.replace("64", "128").replace("48", "96"),
     # photographs
     "empty.png": "",
@@ -59,13 +56,10 @@ FILES: dict[str, Any] = {
     "commas.txt": "1,5;2,5;3,0\n",
     "pixels.txt": "u,v,depth\n10,20,3\n",
     "car.txt": "1 2 3\n1 2 car\n",
-    "few-cells.txt": "id,x,y,z\n0,1,2,3\n1,2\n",
     "two-columns.txt": "1 2\n3 4\n",
     "points.txt": "0 0 2\n",
     "pickled.npy": b"\x80\x04K\x01.",
-    "cut.npy": b"\x93NUMPY\x01\x00",
     "unknown.npy": 0 * MAP,
-    "none.ply": "ply\nformat ascii 1.0\nend_header\n",
     "earlier/depth.npy": MAP,
     # many pairs
     "empty.csv": "\n",

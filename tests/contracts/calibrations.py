@@ -136,7 +136,7 @@ def zed(rig: Drawn) -> tuple[str, ...]:
     keys = (f"{key}_{size}" for size in ("HD", "2K") for key in ("RX", "CV", "RZ"))
     turns = zip(keys, [*turn] * 2, strict=True)
     text += "[STEREO]\n" + "".join(f"{key}={float(value)!r}\n" for key, value in (*shift, *turns))
-    return (text + "\n[MISC]\nSensor_ID=0\n",)
+    return (text,)
 
 
 def realsense(rig: Drawn) -> tuple[str, ...]:

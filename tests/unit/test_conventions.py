@@ -74,25 +74,14 @@ def test_convention_doffs_is_the_difference_of_principal_points():
     assert F * B / (disparity + doffs) == pytest.approx(Z, rel=1e-5)
 
 
-def _cameras():
-    """Two camera matrices that differ, and the world poses of two cameras 0.12 m apart."""
-    K_left, K_right = np.array(K[0]), np.array(K[0])
-    K_right[0, 2] += 3.0
-    E_left = np.eye(4)
-    E_left[:3, 3] = 1.0, -2.0, 0.5
-    right = np.eye(4)
-    right[0, 3] = B
-    return (K_left, K_right), (E_left, E_left @ right)
-
-
 def test_convention_tuple_is_left_and_right_and_poses_are_camera_to_world():
-    cameras, poses = _cameras()
+    K_left, K_right, E_left, E_right = np.array(K[0]), np.array(K[0]), np.eye(4), np.eye(4)
+    K_right[0, 2] += 3.0
+    E_left[:3, 3], E_right[:3, 3] = (1.0, -2.0, 0.5), (1.0 + B, -2.0, 0.5)
     right = np.zeros((*(2 * side for side in SIZE), 3), np.float32)
-    (rig,) = GeometryGuidance(right, cameras, poses, cropped=True).rigs
+    (rig,) = GeometryGuidance(right, (K_left, K_right), (E_left, E_right), cropped=True).rigs
     assert rig.K_right[0, 2] - rig.K_left[0, 2] == pytest.approx(3.0)
-    assert rig.E[0, 3] == pytest.approx(B, abs=1e-6) and rig.T_right_from_left[0, 3] == pytest.approx(
-        -B, abs=1e-6
-    )
+    assert (rig.E[0, 3], rig.T_right_from_left[0, 3]) == pytest.approx((B, -B), abs=1e-6)
 
 
 def test_convention_masks_are_boolean_and_nothing_is_nan():
