@@ -34,7 +34,8 @@ NERF = """{"fl_x": 60, "w": 64, "h": 48, "frames": [
 {"file_path": "./right.png", "transform_matrix": [[1, 0, 0, 0.12], [0, 1, 0, 0], [0, 0, 1, 0]]}]}"""
 K, E, MAP = np.array([[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]), np.eye(4), np.ones((48, 64), np.float32)
 E[0, 3] = 0.12
-FILES: dict[str, Any] = {
+EMPTY = ("empty.png", "l/a.png", "l/b.png", "r/b.png", "texts/a.md", "theirs/model.safetensors")
+FILES: dict[str, Any] = dict.fromkeys(EMPTY, "") | {
     # cameras
     "K.txt": K,
     "K-nan.txt": np.where(K == 0, np.nan, K),
@@ -47,7 +48,6 @@ FILES: dict[str, Any] = {
     "E-still.txt": np.eye(4),
     "large.json": NERF.replace("64", "128").replace("48", "96"),
     # photographs
-    "empty.png": "",
     "cut.png": lambda path: path.write_bytes(Path("left.png").read_bytes()[:1000]),
     "small.png": Image.new("RGB", (64, 31)).save,
     "third.png": Image.new("RGB", (64, 48)).save,
@@ -65,17 +65,12 @@ FILES: dict[str, Any] = {
     "empty.csv": "\n",
     "short.csv": "a.png\n",
     "pairs.csv": "left.png,right.png\n",
-    "l/a.png": "",
-    "l/b.png": "",
-    "r/b.png": "",
-    "texts/a.md": "",
     "mine/pairs.csv": "left.png,right.png\n",
     "drive.mcap": b"\0" * 99,
     # other commands
     "map.npy": MAP,
     "small.npy": MAP[:4, :4],
     "integers.npy": MAP.astype(int),
-    "theirs/model.safetensors": "",
 }
 
 

@@ -1,4 +1,4 @@
-"""``geodiff convert``: every checkpoint format to a folder that loads, and clear refusals."""
+"""``geodiff convert``: folders that load, and refusals; numbers and other checkpoints: tests/parity."""
 
 import json
 from pathlib import Path
@@ -9,14 +9,10 @@ import torch
 from diffusers import AutoencoderKL, AutoencoderKLQwenImage, QwenImageTransformer2DModel
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
-from geodiff_plugin.cli.convert import run_convert
-from geodiff_plugin.priors import find_prior, load_prior
+from geodiff_plugin.priors import find_prior
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
-from geodiff_plugin.priors.ppd import PixelDiT
 from tests.conftest import make_text_encoder, make_tokenizer, make_vae
-from tests.contracts.tiny_priors import make_ppd
 from tests.parity import marigold_v2_reference as reference
 from tests.parity.depthfm_reference import HPARAMS, VAE
 from tests.parity.depthmaster_reference import UNET
@@ -50,12 +46,11 @@ def checkpoint():
 def convert(geodiff, tmp_path, tmp_path_factory):
     """Save an object and convert it to ``out``."""
 
-    def run(content, part=None):
+    def run(content):
+        vae = tmp_path_factory.mktemp("vae")
         torch.save(content, tmp_path / "weights.ckpt")
-        if part is None:
-            part = tmp_path_factory.mktemp("vae")
-            fill(AutoencoderKL(**VAE), "vae.").save_pretrained(part)
-        return geodiff("convert", tmp_path / "weights.ckpt", tmp_path / "out", "--with", part)
+        fill(AutoencoderKL(**VAE), "vae.").save_pretrained(vae)
+        return geodiff("convert", tmp_path / "weights.ckpt", tmp_path / "out", "--with", vae)
 
     return run
 
@@ -131,38 +126,6 @@ def test_shards_keep_their_index(geodiff, tmp_path):
     index = json.loads((tmp_path / "out" / "model.safetensors.index.json").read_text())["weight_map"]
     assert index == {k: f"model-0000{i}-of-00002.safetensors" for i, k in ((1, "a"), (2, "b"))}
     assert set(load_file(tmp_path / "out" / index["a"])) == {"a", "tied"}
-
-
-# Pixel-Perfect Depth with an encoder ---------------------------------------------------------------------
-
-
-def save_depth_anything(folder) -> DepthAnythingForDepthEstimation:
-    """A small Depth Anything V2 as transformers saves it."""
-    torch.manual_seed(0)
-    vit = {"hidden_size": 64, "num_hidden_layers": 4, "num_attention_heads": 1, "mlp_ratio": 1}
-    stages = {"out_features": [f"stage{i}" for i in range(1, 5)], "reshape_hidden_states": False}
-    backbone = Dinov2Config(**vit, **stages, image_size=28, patch_size=14)
-    sizes = {"reassemble_hidden_size": 64, "neck_hidden_sizes": [8] * 4, "fusion_hidden_size": 8}
-    model = DepthAnythingForDepthEstimation(DepthAnythingConfig(backbone_config=backbone, **sizes))
-    model.save_pretrained(folder)
-    return model
-
-
-def test_ppd_takes_its_encoder_from_a_folder_of_transformers(convert, tmp_path):
-    model, dit = save_depth_anything(tmp_path / "da2"), PixelDiT(16, 2, 2, semantic_size=64)
-    state = {f"dit.{name}": value for name, value in dit.state_dict().items()}
-    assert convert(state, tmp_path / "da2").code == 0
-    pipe = load_prior(tmp_path / "out")
-    torch.testing.assert_close(dict(pipe.dit.state_dict()), dict(dit.state_dict()))
-    wanted = model.backbone.state_dict()
-    assert all(torch.equal(v, wanted[name]) for name, v in pipe.semantic_encoder.state_dict().items())
-    make_ppd().dit.save_pretrained(tmp_path / "encoder")
-    wide = {f"dit.{name}": v for name, v in PixelDiT(16, 2, 2, semantic_size=128).state_dict().items()}
-    for content, encoder, sentence in ((wide, "da2", "128 wide"), (state, "encoder", "--with")):
-        torch.save(content, tmp_path / "weights.ckpt")
-        with pytest.raises(ValueError, match=sentence):
-            run_convert([tmp_path / "weights.ckpt", tmp_path / "more"], str(tmp_path / encoder))
-    assert {path.name for path in tmp_path.iterdir()} == {"weights.ckpt", "da2", "out", "encoder"}
 
 
 # Marigold V2 ---------------------------------------------------------------------------------------------

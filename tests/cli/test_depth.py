@@ -1,12 +1,7 @@
-"""``geodiff depth`` end to end on tiny random priors: files, report, Ctrl-C; info, demo and bench."""
+"""``geodiff depth`` end to end on tiny random priors: files, report; info, demo and bench."""
 
 import json
-import os
 import re
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -114,27 +109,6 @@ def test_seeds_presets_and_range(geodiff, command):
     assert paper["gradient"] == "full" and paper["g_s_range"] == [1.0, 5.0]
     guidance = json.loads(geodiff(*words, "--json", "--steps", 1).out)["guidance"]
     assert guidance["gradient"] == "denoised" and guidance["depth_range"] == [1.0, 5.0]
-
-
-def test_interrupt_of_a_running_process(command, pair_files):
-    """Ctrl-C while it denoises: exit code 130, no traceback, nothing written."""
-    before = names_in(pair_files.folder)
-    process = subprocess.Popen(
-        [sys.executable, "-m", "geodiff_plugin", *map(str, command), "--steps", "1000"],
-        stderr=subprocess.PIPE,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        # A job in the background of a script ignores Ctrl-C, and hands that down.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    heard, deadline = b"", time.monotonic() + 120
-    while b"guided steps" not in heard and time.monotonic() < deadline:
-        heard += os.read(process.stderr.fileno(), 4096)
-    process.send_signal(signal.SIGINT)
-    rest = process.communicate(timeout=60)[1]
-    assert process.returncode == 130, heard + rest
-    said = b"geodiff: interrupted; the same command resumes"
-    assert b"Traceback" not in rest and rest.rstrip().endswith(said)
-    assert names_in(pair_files.folder) == before
 
 
 def test_demo(geodiff, prior, pair_files, monkeypatch):

@@ -1,6 +1,5 @@
 """``geodiff depth --estimate-pose`` on a pair as from a phone; what goes through a lens on its way there."""
 
-import json
 import math
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.formats.images import distortion_from_text
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.types import Rig
-from tests.cli.conftest import QUICK, report_of
+from tests.cli.conftest import report_of
 from tests.scenes import render_pair
 
 pytest.importorskip("poselib")
@@ -99,24 +98,6 @@ def test_a_known_length_gives_the_unit_behind_a_lens(estimate, pair):
     assert report["inputs"]["baseline_m"] == pytest.approx(true, rel=0.25)
 
 
-def test_poses_of_structure_from_motion_have_no_unit_either(geodiff, command, pair_files, textured_plane):
-    K, axes = textured_plane.K, np.diag([1.0, -1.0, -1.0, 1.0])
-    frames = [
-        {"file_path": path.name, "transform_matrix": (pose @ axes).tolist()}
-        for path, pose in ((pair_files.left, np.eye(4)), (pair_files.right, textured_plane.E))
-    ]
-    lens = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5, "w": 64, "h": 48}
-    Path("transforms.json").write_text(json.dumps(lens | {"frames": frames}))
-    views = [*command[:3], "--calib", "transforms.json", *command[5:], *QUICK]
-    for more, unit, said in (
-        ([], None, "the calibration's lengths (no unit)"),
-        (["--baseline", "0.12"], "m", " m to "),
-    ):
-        answer = geodiff(*views, *more, "--overwrite")
-        assert answer.code == 0 and said in answer.out, answer
-        assert report_of()["unit"] == unit
-
-
 def test_every_photograph_has_its_lens():
     """First coefficients, from the options, else from the calibration; a further view has the left one's."""
 
@@ -130,13 +111,10 @@ def test_every_photograph_has_its_lens():
     own = (distortion_from_text(one), distortion_from_text(straight))
     for expected, given in (
         ([None, None], {}),
-        ([0.1, 0.1, 0.1], {"distortion": (one,), "view": view}),
         ([0.1, 0.2, 0.1, 0.1], {"distortion": (one, other), "view": two}),
         ([None, None, None, 0.2], {"view": two, "view_distortion": (straight, other)}),
         ([0.1, 0.1, None], {"distortion": (one,), "view": view, "view_distortion": (straight,)}),
-        ([0.1, None, 0.1], {"own": own, "view": view}),
         ([0.1, None, 0.2], {"own": own, "view": view, "view_k": view, "view_distortion": (other,)}),
-        ([None, None, None], {"view": view, "view_k": view}),
     ):
         assert told(**given) == expected, given
     for error, given in (

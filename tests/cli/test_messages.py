@@ -95,5 +95,6 @@ def test_the_summary_says_the_verdict_first():
     verdict, metres = {"status": "trusted", "reasons": [], "signs": signs}, "1.00 m to 4.00 m, median 2.00 m"
     report = {"depth": summary, "verdict": verdict, "seconds": {"load": 1.0}, "unit": "m", "own_scale": None}
     assert summary_line(report, "out/") == f"{metres}; trusted, confidence 0.88, 70 % matched; 1.0 s -> out/"
+    assert "in the calibration's lengths (no unit)" in summary_line(report | {"unit": None}, "out/")
     verdict |= {"status": "not trusted", "reasons": ["E is wrong."]}
     assert summary_line(report, "out/") == f"NOT TRUSTED: E is wrong. (Unconfirmed: {metres}; 1.0 s -> out/)"

@@ -29,17 +29,6 @@ def test_exports_stand_beside_the_ply(geodiff, result, textured_plane, command):
     assert not (again / "cloud.glb").exists() and not (again / "cameras.txt").exists()
 
 
-def test_images_of_one_name_are_named_with_their_folders(geodiff, command, pair_files):
-    images = []
-    for side, path in (("image_2", pair_files.left), ("image_3", pair_files.right)):
-        Path(side).mkdir()
-        images.append(shutil.copy(path, Path(side, "000000.png")))
-    answer = geodiff("depth", *images, *command[3:], *QUICK, "--export", "colmap", "-q")
-    assert answer.code == 0, answer.err
-    lines = Path("geodiff-out", "images.txt").read_text().splitlines()
-    assert [line.split()[-1] for line in lines[1::2]] == ["image_2/000000.png", "image_3/000000.png"]
-
-
 def test_a_colmap_model_names_what_its_cameras_took(geodiff, command, pair_files):
     """Of a pair as if its lenses had distortion, and a third view without."""
     Image.fromarray(255 - np.asarray(Image.open(pair_files.right))).save("third.png")

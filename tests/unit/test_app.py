@@ -69,11 +69,10 @@ def test_spread_of_a_distance_agrees_with_drawn_errors():
 @pytest.fixture(scope="module")
 def photographs(textured_plane, tmp_path_factory):
     """Paths of the left and the right one, in folders of their own as the page keeps them."""
-    paths = []
-    for side in ("left", "right"):
-        paths.append(tmp_path_factory.mktemp(side) / f"{side}.png")
-        Image.fromarray(getattr(textured_plane, side)).save(paths[-1])
-    return [str(path) for path in paths]
+    paths = [str(tmp_path_factory.mktemp(side) / f"{side}.png") for side in ("left", "right")]
+    for path, image in zip(paths, (textured_plane.left, textured_plane.right), strict=True):
+        Image.fromarray(image).save(path)
+    return paths
 
 
 def test_fields_become_options_and_those_of_another_way_are_left_out(photographs, tmp_path):
@@ -175,12 +174,8 @@ def test_points_are_marked_where_they_were_clicked_and_told_in_words(result):
 def test_a_stop_ends_a_job_between_steps(priors, asked):
     stop = threading.Event()
 
-    def report(share: float, name: str) -> None:
-        if "Guided step" in name:
-            stop.set()
-
     with pytest.raises(Stopped):
-        run_job(replace(asked, steps=3), priors, stop, report)
+        run_job(replace(asked, steps=3), priors, stop, lambda _, name: "Guided" in name and stop.set())
     assert "step" not in vars(priors.get("tiny").scheduler)  # nothing of the call is left behind
 
 

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip("pycolmap")
 
@@ -48,9 +49,8 @@ def solved() -> SolvedCapture:
 
 def turn_error_deg(E: np.ndarray) -> float:
     """Of frames two apart, in the median; the world's frame does not matter."""
-    R, R_true = ((np.linalg.inv(P[:-2]) @ P[2:])[:, :3, :3] for P in (E, TRUE))
-    cosines = (np.einsum("nij,nij->n", R, R_true) - 1) / 2
-    return float(np.median(np.degrees(np.arccos(np.clip(cosines, -1, 1)))))
+    found, true = (Rotation.from_matrix((np.linalg.inv(P[:-2]) @ P[2:])[:, :3, :3]) for P in (E, TRUE))
+    return float(np.degrees(np.median((found.inv() * true).magnitude())))
 
 
 def depth_ratios(found: SolvedCapture) -> np.ndarray:
