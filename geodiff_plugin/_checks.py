@@ -30,17 +30,13 @@ class MissingFileError(InputFileError, FileNotFoundError):
     """A file or folder that does not exist."""
 
 
-def quoted(got: object) -> str:
-    """A given value as a single line of limited length, for a message."""
-    text = " ".join(str(got).split())  # arrays are printed over several lines; file names may hold line ends
-    return text if len(text) <= LONGEST_GOT else f"{text[:LONGEST_GOT]}..."
-
-
 def bad_value(
     name: str, expected: str, got: object, cure: str = "", error: type[InputError] = InputError
 ) -> NoReturn:
-    """Raise ``<name> must be <expected>; got <got>. <cure>``."""
-    raise error(f"{name} must be {expected}; got {quoted(got)}." + (f" {cure}" if cure else ""))
+    """Raise ``<name> must be <expected>; got <got>. <cure>``, of ``got`` one line of limited length."""
+    text = " ".join(str(got).split())  # arrays are printed over several lines; file names may hold line ends
+    text = text if len(text) <= LONGEST_GOT else f"{text[:LONGEST_GOT]}..."
+    raise error(f"{name} must be {expected}; got {text}." + (f" {cure}" if cure else ""))
 
 
 def bad_type(name: str, expected: str, got: object, cure: str = "") -> NoReturn:

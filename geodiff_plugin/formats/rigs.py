@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import configparser
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Any, TypeVar
-from xml.etree import ElementTree
 
 import numpy as np
-import yaml
 
 from geodiff_plugin._camera_checks import check_intrinsics, check_pose
 from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_positive, refuse
@@ -33,10 +30,6 @@ LENS_MODELS = {
     **dict.fromkeys("fisheye opencv_fisheye equidistant kannalabrandt4 kannalabrandt8".split(), "fisheye"),
 }
 COEFFICIENT_COUNTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
-UNFINISHED = (
-    *(LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError),
-    *(yaml.YAMLError, configparser.Error, ElementTree.ParseError),
-)
 CHECK_FILE = "Check the calibration file."
 
 
@@ -90,8 +83,8 @@ def reading_whole(source: object, summary: str) -> Iterator[None]:
         raise
     except InputError as error:
         refuse(f"{source}: {error}")
-    except UNFINISHED as error:
-        got = str(error) if isinstance(error, (ValueError, yaml.YAMLError)) else "other entries"
+    except Exception as error:  # of any kind that a damaged file leads to
+        got = str(error) if isinstance(error, ValueError) else "other entries"
         got = f"no {error}" if isinstance(error, KeyError) else got
         bad_value(str(source), f"a whole {summary}", got, "Is the file cut off?")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import configparser
 import json
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from typing import Any
 from xml.etree import ElementTree
 
@@ -184,34 +184,19 @@ def _rs_printed(text: str, choice: CameraChoice) -> tuple[Camera, Camera, np.nda
     return left, right, transform(rotation[:9], translation[:3], "the extrinsics")
 
 
-def _objects(value: Any, name: str = "") -> Iterator[tuple[str, Entries]]:
-    """Every object of a JSON value with the keys that lead to it, in the order of the file."""
-    if isinstance(value, dict):
-        yield name.lower(), value
-        for key, inner in value.items():
-            yield from _objects(inner, f"{name}/{key}")
-    elif isinstance(value, list):
-        for inner in value:
-            yield from _objects(inner, name)
-
-
 def _rs_json(text: str) -> tuple[Camera, Camera, np.ndarray]:
     """Of ``rs2_intrinsics``, left before right, and ``rs2_extrinsics`` between them, under any names."""
-    objects = list(_objects(json.loads(text)))
-    views = [(name, values) for name, values in objects if "ppx" in values]
-    # A file of the whole device has colour and depth too; the pair is the two infrared ones.
-    infrared = [view for view in views if re.search(r"infra|left|right|\bir", view[0])]
-    views = infrared if len(infrared) >= 2 else views
-    other = re.compile("color|depth|imu|gyro|accel")
-    between = [values for name, values in objects if "translation" in values and not other.search(name)]
+    objects = list[Entries]()
+    json.loads(text, object_hook=objects.append)
+    views = [values for values in objects if "ppx" in values]
+    between = [values for values in objects if "translation" in values]
     if len(views) != 2 or len(between) != 1:
-        expected = "two rs2 intrinsics (fx, fy, ppx, ppy) of the infrared pair and their extrinsics"
+        expected = "two rs2 intrinsics (fx, fy, ppx, ppy) of the infrared pair and their extrinsics alone"
         bad_value("the file", expected, f"{len(views)} and {len(between)}", "Is the file cut off?")
     # rs2 keeps a rotation column by column.
     R = array_of(between[0]["rotation"], (3, 3), "the rotation of the extrinsics").T
     T = transform(R, between[0]["translation"], "the extrinsics")
-    # From the left to the right one x becomes smaller; a file that says it the other way round is inverted.
-    return _rs_camera(views[0][1]), _rs_camera(views[1][1]), T if T[0, 3] <= 0 else np.linalg.inv(T)
+    return _rs_camera(views[0]), _rs_camera(views[1]), T
 
 
 def read_realsense(texts: tuple[str, ...], choice: CameraChoice) -> Rig:

@@ -146,9 +146,8 @@ def realsense(rig: Drawn) -> tuple[str, ...]:
         return entries | {"coeffs": [*rig.lenses[n], 0.0]}
 
     between = {"rotation": rig.T[:3, :3].T.ravel().tolist(), "translation": rig.T[:3, 3].tolist()}
-    views = {"infra1": camera(0), "infra2": camera(1), "color": camera(1)}
-    extrinsics = {"infra1_to_infra2": between, "infra1_to_color": between}
-    return (json.dumps({"serial": "1", "intrinsics": views, "extrinsics": extrinsics}, indent=1),)
+    entries = {"intrinsics": {"infra1": camera(0), "infra2": camera(1)}, "extrinsics": between}
+    return (json.dumps({"serial": "1"} | entries, indent=1),)
 
 
 def realsense_printed(rig: Drawn) -> tuple[str, ...]:

@@ -128,7 +128,7 @@ REFUSALS = [
     ("booster", "<opencv_storage>", '<!DOCTYPE x [<!ENTITY a "b">]><opencv_storage>', "entities"),
     ("booster", "</opencv_storage>", "", "must be a whole Booster xml"),
     ("mvsnet", "0.0 0.0 0.0 1.0\n\nintrinsic", "1.0 0.0 0.0 1.0\n\nintrinsic", "last row .*transposed"),
-    ("realsense", '"translation"', '"moved"', "their extrinsics; got 2 and 0"),
+    ("realsense", '"translation"', '"moved"', "their extrinsics alone; got 2 and 0"),
     ("realsense_printed", 'To  "Infrared 2"', 'To  "Depth"', "rotation of the extrinsics must be 9"),
     ("oak", '"toCameraSocket": 2', '"toCameraSocket": -1', "a way from socket 1 to 2"),
     ("ros", "  - 91.0\n", "  - 175.0\n", "the same in both. These are of single cameras"),

@@ -34,14 +34,7 @@ def picture(number: int, side: int) -> np.ndarray:
     return cv2.resize(rng.integers(0, 255, (6, 8, 3), dtype=np.uint8), SIZE[::-1])
 
 
-def write_bag(
-    path: Path,
-    topics=TOPICS,
-    encoding: str = "rgb8",
-    times=((0.0, 0.1, 0.2), (0.001, 0.099, 0.35)),
-    images=None,
-    **info,
-) -> Path:
+def write_bag(path: Path, topics=TOPICS, encoding: str = "rgb8", images=None, **info) -> Path:
     """A bag with pictures of both cameras at those seconds, and their camera_info, 0.12 m apart."""
     ros2, info = path.suffix == ".mcap", PINHOLE | {"K": K} | info
     store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
@@ -64,7 +57,7 @@ def write_bag(
             roi = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
             base = topic.removesuffix("/compressed").rpartition("/")[0]
             write(f"{base}/camera_info", "CameraInfo", 0, *SIZE, info["model"], *matrices, 0, 0, roi)
-            for number, seconds in enumerate(times[side]):
+            for number, seconds in enumerate(((0.0, 0.1, 0.2), (0.001, 0.099, 0.35))[side]):
                 image, at_ns = picture(number, side) if images is None else images[side], round(1e9 * seconds)
                 if topic.endswith("/compressed"):
                     data = cv2.imencode(".png", image[..., ::-1])[1].ravel()

@@ -197,9 +197,6 @@ def test_realsense_models(reading):
         assert of(model, [0.0] * 5).rectified, "zeros are no lens"
         with pytest.raises(InputError, match=r"lens model of the left .*got .*rectify"):
             of(model, five)
-    between = data["extrinsics"]["infra1_to_infra2"] | {"translation": [0.3, 0, 0]}
-    data["extrinsics"] = {"right_to_left": between}
-    assert of("none", [0.0] * 5).E[0, 3] == pytest.approx(0.3), "the other way round it is inverted"
 
 
 def test_oak_scales_to_the_image_and_takes_the_right_cameras_intrinsics(reading):
