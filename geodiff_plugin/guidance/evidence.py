@@ -35,10 +35,9 @@ def cleaned(image_01: Tensor, config: GuidanceConfig) -> Tensor:
 def make_evidence(
     left_01: Tensor, given: Inputs, config: GuidanceConfig, needs_matches: bool, measured: bool = False
 ) -> Evidence:
-    """Clean the photographs, refine the poses, and prepare the ``Evidence`` of one left image.
+    """Clean the photographs, refine the poses, and prepare the ``Evidence`` of one native left image.
 
-    ``left_01 (3, H, W)`` float32 in [0, 1] has its native size; ``needs_matches`` is whether the volume is
-    aggregated and checked against each view, ``measured`` whether the baselines' lengths are measured.
+    ``needs_matches``: the volume is checked against each view; ``measured``: the baselines' lengths are.
     """
     views, K_left, points = given.on(left_01.device)
     if not views:
@@ -53,16 +52,10 @@ def make_evidence(
 
 
 class EvidenceStore:
-    """Remembers evidence by the values that it was made from: images, cameras, points and settings.
-
-    Give one to the ``GeometryGuidance`` of every call that is to share: ``guidance.evidence_store = store``.
-    """
+    """Remembers evidence by the values that it was made from, for every guidance whose store it is."""
 
     def __init__(self, size: int = 2, copies: bool = True) -> None:
-        """Keep the evidence of the last ``size`` images; about 100 MB each with its cost volume.
-
-        ``copies=False`` keeps the images themselves; then nobody may change them in place.
-        """
+        """Of the last ``size`` images, some 100 MB each; without copies nobody may change them in place."""
         self._size, self._copies, self._spared = size, copies, 0.0
         # Tensors and settings that an entry was made from, the entry, and the seconds that it took.
         self._entries: list[tuple[list[Tensor | None], tuple[Any, ...], Evidence, float]] = []

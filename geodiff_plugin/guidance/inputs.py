@@ -1,7 +1,4 @@
-"""What the user gives beside the left image, in any of its forms, checked: views, cameras, points.
-
-S3.3 has two views with known cameras; more views, and points, go beyond it.
-"""
+"""What the user gives, in any of its forms, checked: left image, views, cameras, points (S3.3)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Adapters of diffusion depth priors, one a file, and how a prior is found by name (paper S4).
-
-A new prior is a new file and one line in ``PRIORS``.
-"""
+"""Diffusion depth priors, one a file, and how one is found by name; ``PRIORS`` lists them (S4)."""
 
 from __future__ import annotations
 
@@ -87,19 +84,16 @@ class FoundPrior:
 
 
 def find_prior(name: str | Path, variant: str | None = None, **hub: Any) -> FoundPrior:
-    """Find a prior and tell which it is: by its configs, or a key of ``PRIORS`` and a colon before its name.
-
-    Arguments and errors as ``load_prior``.
-    """
-    key, typed = None, str(name)
+    """As ``load_prior``; a key of ``PRIORS`` and a colon before the name say which prior it is."""
+    typed = str(name)
     if typed == MAP_LAYOUT.name:
         return FoundPrior("map", MAP_LAYOUT)
-    prefix, _, rest = typed.partition(":")
-    if rest and prefix in PRIORS:
-        key, typed = prefix, rest
+    key, _, rest = typed.partition(":")
+    if rest and key in PRIORS:
+        typed = rest
     else:
         refuse(typed)
-    key = key or _recognise(Layout(fetch(typed, hub), typed))
+        key = _recognise(Layout(fetch(typed, hub), typed))
     return FoundPrior(key, Layout(fetch(typed, hub, weights=True, variant=variant), typed, variant))
 
 

@@ -15,12 +15,7 @@ from geodiff_plugin._checks import bad_value
 
 
 class DirectScheduler(SchedulerMixin, ConfigMixin):
-    """One step whose result is the network's output, for networks that answer with the clean latent.
-
-    Args:
-        timestep: the timestep input of the network, 999 for Lotus, 1 for DepthMaster.
-        prediction_type: always ``"sample"``; kept in the config, where others look for it.
-    """
+    """One step whose result is the network's output, the clean latent; the network is told ``timestep``."""
 
     order = 1
     init_noise_sigma = 1.0
@@ -50,12 +45,7 @@ class DirectScheduler(SchedulerMixin, ConfigMixin):
 
 
 class SidesOf(MarigoldImageProcessor):
-    """Resizes each side to a multiple of ``side`` pixels, each with a factor of its own, and never pads.
-
-    Args:
-        side: what both sides are multiples of, pixels.
-        grow: always round up; else to the nearest multiple.
-    """
+    """Resizes each side to a multiple of ``side`` pixels, the next (``grow``) or nearest one; never pads."""
 
     def __init__(self, side: int, grow: bool = False) -> None:
         super().__init__(vae_scale_factor=side)

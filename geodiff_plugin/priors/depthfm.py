@@ -28,16 +28,9 @@ def cosine_alpha_bar(time: float) -> float:
 
 
 class DepthFMPipeline(DepthDiffusionPipeline):
-    """Log depth by a flow that starts from the image itself.
+    """Log depth by a flow that starts from the image itself, with noise of ``noising_step``, 0 (none) to 999.
 
-    Args:
-        unet: takes ``cat[z_t, image latent]`` and answers with the velocity towards depth.
-        vae: of Stable Diffusion 1.5.
-        scheduler: rectified flow without a shift.
-        prompt: the empty prompt's embedding, which comes with the weights.
-        noising_step: how much noise the image latent gets to start from, 0 (none) to 999.
-        default_denoising_steps: the authors run 2 to 4.
-        default_processing_resolution: longer side, pixels; the authors run 0, the image's own.
+    The authors run 2 to 4 steps, at ``processing_resolution=0``.
     """
 
     model_cpu_offload_seq = "unet->vae"

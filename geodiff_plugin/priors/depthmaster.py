@@ -19,10 +19,7 @@ TIMESTEP = 1
 
 
 class FourierBlock(nn.Module):
-    """Features mended twice, in their Fourier magnitude and angle and in space, and fused.
-
-    The submodules are named as in the published weights.
-    """
+    """Features mended in their Fourier magnitude and angle and in space; named as the published weights."""
 
     def __init__(self, channels: int, groups: int = 8) -> None:
         super().__init__()
@@ -52,10 +49,7 @@ class FourierBlock(nn.Module):
 
 
 class FourierUNet(UNet2DConditionModel):
-    """``UNet2DConditionModel`` whose middle block is followed by a ``FourierBlock`` named ``fftblock``.
-
-    Everything else, config and weights included, is the stock class's.
-    """
+    """``UNet2DConditionModel`` whose middle block is followed by a ``FourierBlock`` named ``fftblock``."""
 
     # The wraps keeps the signature, from which diffusers reads what a config may hold.
     @functools.wraps(UNet2DConditionModel.__init__)  # type: ignore[misc]
@@ -69,11 +63,7 @@ class FourierUNet(UNet2DConditionModel):
 
 
 class DepthMasterPipeline(DepthDiffusionPipeline):
-    """Deterministic depth in one step; affine in the square root of disparity.
-
-    Its U-Net takes the image latent alone and answers with the clean depth latent; the autoencoder is that of
-    Stable Diffusion 2, the prompt is empty.
-    """
+    """One step from the image latent alone to the clean latent of the square root of disparity."""
 
     max_steps = 1
     deterministic = True

@@ -106,10 +106,7 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         generator: Generators,
         domain: str | None = None,
     ) -> Condition:
-        """Latent of the image, prompt, and class labels ``(N * E, 2, 10 or 4)`` for depth and normals.
-
-        ``domain`` is one of ``DOMAINS`` (an object is without background), or the default.
-        """
+        """Latent, prompt, and labels ``(N * E, 2, 10 or 4)`` of both halves; ``domain`` of ``DOMAINS``."""
         domain = check_choice(domain or self.config.default_domain, "domain", DOMAINS)
         couple_pairs(self.unet)  # again: under other processors depth and normals do not see each other
         of_image = self.unet.config.projection_class_embeddings_input_dim == IMAGE_EMBEDDING

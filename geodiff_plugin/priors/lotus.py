@@ -24,10 +24,8 @@ DEPTH_TASK = (1.0, 0.0)
 class LotusPipeline(DepthDiffusionPipeline):
     """Lotus-G (8 input channels: image and noise) or Lotus-D (4: image alone), as the U-Net says.
 
-    Not deterministic even as D: the image latent is drawn from the VAE's posterior.
-
-    ``prediction_type`` is ``"depth"`` or ``"disparity"``, as only the repository's name says. A scheduler of
-    noise prediction (SD-2's own, which such a folder may carry) is replaced: the network was trained without.
+    Not deterministic even as D: the image latent is drawn from the VAE's posterior. A scheduler of noise
+    prediction (SD-2's own, which such a folder may carry) is replaced: the network was trained without.
     """
 
     model_cpu_offload_seq = "text_encoder->unet->vae"

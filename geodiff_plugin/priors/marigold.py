@@ -1,7 +1,4 @@
-"""Marigold v1-0, v1-1, LCM, and every fine-tune that keeps ``MarigoldDepthPipeline`` (paper S3.1).
-
-Marigold and Stable Diffusion fine-tuned end to end take one step from zeros (arXiv 2409.11355).
-"""
+"""Every prior of ``MarigoldDepthPipeline`` (S3.1), and those tuned end to end to one (arXiv 2409.11355)."""
 
 from __future__ import annotations
 

@@ -32,10 +32,9 @@ def _statistics(vae: AutoencoderKLQwenImage, like: Tensor) -> tuple[Tensor, Tens
 
 
 def frame_of(vae: AutoencoderKLQwenImage, latents: Tensor) -> Tensor:
-    """Decode normalised latents ``(B, C, h, w)`` to ``(B, 3, 8 h, 8 w)``, float32 or wider.
+    """Normalised latents ``(B, C, h, w)`` to ``(B, 3, 8 h, 8 w)``, float32 or wider, as ``vae.decode``.
 
-    Without the clamp at the end of ``vae.decode``, which has no gradient beyond [-1, 1], where near and far
-    lie. Slicing and tiling are kept.
+    But for its clamp, which has no gradient beyond [-1, 1], where near and far lie.
     """
     wide = widened(latents)
     mean, deviation = _statistics(vae, wide)
@@ -57,16 +56,9 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
     """Depth in one step of rectified flow that starts from the image's own latent.
 
     The transformer recomputes its blocks in a backward pass (``enable_gradient_checkpointing``), without
-    which the full gradient does not fit. ``processing_resolution=0`` is what the authors measure at.
-
-    Args:
-        transformer: that of Qwen-Image-Edit, with the checkpoint's LoRA.
-        vae: that of Qwen-Image, with the checkpoint's decoder where one was trained.
-        scheduler: rectified flow; only its arithmetic is used.
-        prompt: the embedding that came with the checkpoint.
-        prediction_type: ``"log"``, ``"depth"`` (their "Uniform") or ``"disparity"``.
-        sample_latent: draw the image's latent from the posterior, as their ``infer.py``, instead of its mode.
-        default_processing_resolution: longer side, pixels; they trained at 768.
+    which the full gradient does not fit. ``processing_resolution=0`` is what the authors measure at; they
+    trained at 768. With ``sample_latent`` the image's latent is drawn from the posterior, as in their
+    ``infer.py``; else it is its mode.
     """
 
     max_steps = 1

@@ -63,11 +63,7 @@ def decode_picture(vae: Any, z0: Tensor) -> Tensor:
 
 @dataclass
 class DepthOutput(MarigoldDepthOutput):
-    """``MarigoldDepthOutput`` and what else a prior tells.
-
-    Attributes:
-        extras: further maps by name, such as ``"normals"``, shaped as ``prediction`` with their own channels.
-    """
+    """``MarigoldDepthOutput``, and further maps by name, such as ``"normals"``, of their own channels."""
 
     extras: dict[str, np.ndarray | Tensor] = field(default_factory=dict)
 
@@ -213,11 +209,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         self.scheduler.set_timesteps(num_inference_steps, device=device)
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
-        """The network's output as the scheduler's ``step`` takes it; called once a step.
-
-        Of latents ``(B, C, h, w)``, differentiable in them if ``sees_latents``; ``timestep`` is 0-d, out of
-        ``scheduler.timesteps``, ``condition`` that of these ``B`` members.
-        """
+        """The network's output as the scheduler's ``step`` takes it, of latents ``(B, C, h, w)``."""
         raise NotImplementedError
 
     def decode_picture(self, z0: Tensor) -> Tensor:

@@ -33,10 +33,7 @@ POSITION_OFFSET = 0.1
 
 
 def sampling_timesteps(steps: int) -> list[float]:
-    """1000 and on in steps of 1001 / n, rounded.
-
-    For some n (29, 49, 58, ...) floating point gives the authors one more, -1; here there are n.
-    """
+    """1000 and on in steps of 1001 / n, rounded; without the -1 that rounding gives the authors at times."""
     step = -(LAST_TIMESTEP + 1) / steps
     times = torch.arange(LAST_TIMESTEP, -1, step, dtype=torch.float32, device="cpu")
     return times.round()[:steps].tolist()
@@ -47,11 +44,7 @@ class AreaImageProcessor(MarigoldImageProcessor):
 
     @staticmethod
     def resize_to_max_edge(image: Tensor, max_edge_sz: int, mode: str) -> Tensor:
-        """The image at the area of ``max_edge_sz x 0.75 max_edge_sz``, whatever its aspect ratio.
-
-        ``max_edge_sz`` is the longer side that an image of 4:3 gets; 1024 is what the network was trained at.
-        As the authors, the mean over areas where it shrinks and cubic where it grows.
-        """
+        """The image at the area of ``max_edge_sz x 0.75 max_edge_sz``, as the authors shrink and enlarge."""
         height, width = image.shape[-2:]
         scale = (max_edge_sz**2 * TRAINING_RATIO / (height * width)) ** 0.5
         size = tuple(max(SIDE, round(side * scale / SIDE) * SIDE) for side in (height, width))
@@ -141,10 +134,7 @@ class _Block(nn.Module):
 
 
 class PixelDiT(ModelMixin, ConfigMixin):
-    """Cascaded diffusion transformer: half of the blocks on patches of twice the size, the rest on patches.
-
-    The width of a token is a multiple of ``4 * num_heads``, the number of blocks even.
-    """
+    """Cascaded diffusion transformer: half of the blocks on patches of twice the size, half on patches."""
 
     _supports_gradient_checkpointing = True
     _no_split_modules = ["_Block"]
@@ -207,16 +197,10 @@ class PixelDiT(ModelMixin, ConfigMixin):
 
 
 class PPDPipeline(DepthDiffusionPipeline):
-    """Pixel-Perfect Depth.
+    """Pixel-Perfect Depth: its latents are depth itself, ``(B, 1, H, W)``, about [-0.5, 0.5].
 
-    Its latents are depth itself, ``(B, 1, H, W)`` on the processing grid, about [-0.5, 0.5].
-    ``processing_resolution`` is the longer side that an image of 4:3 gets; others get the same area.
-
-    Args:
-        dit: the diffusion transformer.
-        semantic_encoder: of Depth Anything V2 Large.
-        scheduler: without shift.
-        default_denoising_steps: 4 in the authors' ``run.py``, 20 where they measure points.
+    ``processing_resolution`` is the longer side that an image of 4:3 gets; others get the same area. The
+    authors run 4 steps, 20 where they measure points.
     """
 
     model_cpu_offload_seq = "semantic_encoder->dit"

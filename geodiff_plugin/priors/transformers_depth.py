@@ -49,18 +49,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
 
 
 class Preparation:
-    """Resizing, padding and normalisation of one checkpoint.
-
-    Args:
-        config: contents of ``preprocessor_config.json``.
-
-    Attributes:
-        kind: key of ``DEFAULTS``.
-        options: ``config`` over the processor's defaults.
-
-    Raises:
-        ValueError: a processor, a resampling or a size that is not known here.
-    """
+    """Resizing, padding and normalisation of one checkpoint, by the contents of its file."""
 
     def __init__(self, config: dict[str, Any]) -> None:
         file = "of preprocessor_config.json"
@@ -79,10 +68,7 @@ class Preparation:
             bad_value(f"size {file}", "a number or a height and a width", size)
 
     def _grid(self, height: int, width: int) -> tuple[tuple[int, int], tuple[int, int], list[int]]:
-        """Rows and columns at each side that ZoeDepth reflects before it resizes; ``(h, w)`` after that.
-
-        And left, right, top, bottom zeros after normalising, to a multiple of a patch (``PADDED_LAST``).
-        """
+        """Rows and columns that ZoeDepth reflects at each side; ``(h, w)`` then; zeros left to bottom."""
         options, rows, columns = self.options, 0, 0
         if self.kind == "ZoeDepth" and options["do_pad"]:
             rows, columns = int((height / 2) ** 0.5 * 3), int((width / 2) ** 0.5 * 3)
@@ -197,13 +183,9 @@ def unit_range(values: Tensor) -> Tensor:
 class TransformersDepthPipeline(DirectMapPipeline):
     """Every model that ``AutoModelForDepthEstimation`` loads, but that of canopy height.
 
-    What guidance moves beside scale and shift is the map itself, pixel by pixel. ``processing_resolution`` is
-    the longer side of that map, 0 for the image's own; ``preprocessor_config.json`` says at which size the
-    network then works.
-
-    ``preparation`` are the contents of that file; ``prediction_type`` is ``"depth"`` or ``"disparity"``, or
-    ``None`` for what the model's class is known to give; ``metric`` says whether maps are in metres (inverse
-    metres in disparity space) without a prompt.
+    ``processing_resolution`` is the longer side of the map, which guidance moves pixel by pixel, 0 for the
+    image's own; ``preparation``, the contents of ``preprocessor_config.json``, says at which size the network
+    works. ``metric``: maps are in metres (inverse metres in disparity space) without a prompt.
     """
 
     model_cpu_offload_seq = "model"
@@ -264,18 +246,18 @@ class TransformersDepthPipeline(DirectMapPipeline):
     ) -> Condition:
         """The relative map of every image, ``(N * E, 1, H, W)`` float32.
 
-        ``prompt_depth`` is ``(N, 1, h, w)`` metres everywhere, for Prompt Depth Anything; a guided call makes
-        it of matches and points, unless it is given one.
+        ``prompt_depth (N, 1, h, w)``, metres everywhere, is for Prompt Depth Anything.
         """
         if prompt_depth is not None:
             prompt_depth = torch.as_tensor(prompt_depth)
             if prompt_depth.ndim != 4 or len(prompt_depth) != len(image):
                 bad_value("prompt_depth", f"({len(image)}, 1, h, w) metres", tuple(prompt_depth.shape))
-        size, maps = (image.shape[-2], image.shape[-1]), []
-        for first in range(0, len(image), batch_size):
-            part = slice(first, first + batch_size)
-            told = None if prompt_depth is None else prompt_depth[part]
-            maps.append(self.predict(image[part].float() / 2 + 0.5, size, told))
+        size, parts = (image.shape[-2], image.shape[-1]), image.split(batch_size)
+        prompts = [None] * len(parts) if prompt_depth is None else prompt_depth.split(batch_size)
+        maps = [
+            self.predict(part.float() / 2 + 0.5, size, prompt)
+            for part, prompt in zip(parts, prompts, strict=True)
+        ]
         self.own_range = None
         if self.metric or prompt_depth is not None:
             ends = torch.cat([torch.stack([self.metres(v) for v in range_of(part)], 1) for part in maps])
@@ -303,9 +285,8 @@ class TransformersDepthPipeline(DirectMapPipeline):
             low, high = prompt.amin((1, 2, 3), keepdim=True), prompt.amax((1, 2, 3), keepdim=True)
             span = (high - low).clamp_min(LEAST_SPAN_M)
             prompt = (prompt - low) / span
-            prompt[:, :, :1, :1] = torch.where(
-                high > low, prompt[:, :, :1, :1], 1.0
-            )  # it divides by the span
+            # It divides by the span.
+            prompt[:, :, :1, :1] = torch.where(high > low, prompt[:, :, :1, :1], 1.0)
             told["prompt_depth"] = prompt.to(self.model.dtype)
         output = self.model(pixel_values=self.prepare(image_01.float()).to(self.model.dtype), **told)
         values = output.predicted_depth.float()[:, None] * span + low  # (B, 1, h', w')

@@ -1,7 +1,4 @@
-"""Confidence: the probability that a pixel's depth is within 10 % of the truth; photometric error.
-
-The error is that of Eq. 14's re-rendered left image, as a report per pixel at the output's resolution.
-"""
+"""Confidence: the probability that a pixel's depth is within 10 % of the truth; photometric error."""
 
 from __future__ import annotations
 
@@ -30,12 +27,10 @@ BY_EVIDENCE = (-0.228, 0.788, 2.42, 0.0864, -15.0)
 #: Which sign each of them may have; 0 for any. Agreement can only raise confidence, and a pixel that no right
 #: camera sees has none, so not being in view can never raise it.
 SIGNS = (0, 1, 1, 1, -1)
-# Photometric errors beyond these tell nothing more.
+# Beyond these photometric errors tell nothing more, nor do errors of the prior as a whole, nor that which is
+# left to a depth: where it is largest many depths are right all the same.
 _LEAST_DIFFERENCE, _MOST_DIFFERENCE = 0.01, 0.1
-# Nor do errors of the prior as a whole.
 _STRONG, _WEAK = 0.03, 0.15
-# Nor does the error of the prior that is left to a depth, beyond these: where it is largest many depths are
-# right all the same, and log-odds that fell on would promise too little.
 _LEAST_LEFT, _MOST_LEFT = 0.0005, 0.05
 # Errors of the prior in log depth: of the best that matches can tell, of one that is of no use.
 _BEST, _USELESS = 0.01, 0.5
@@ -134,10 +129,7 @@ def reprojection(
 def _warped(
     right_01: Tensor, depth_m: Tensor, K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The right image on the left grid and where it is visible, a strip of rows at a time.
-
-    Rays and places to sample at take ten times the memory of the image that comes of them.
-    """
+    """The right image on the left grid and where it is visible, in strips of rows to spare memory."""
     warped = right_01.new_empty((1, right_01.shape[1], *image_size(depth_m)))
     visible = torch.empty_like(depth_m, dtype=torch.bool)
     for rows in row_strips(*image_size(depth_m)):

@@ -1,6 +1,6 @@
 """The prior's estimate at one denoising step: clean latent, relative map, and the way between the two.
 
-Maps cover the pixels of the image, latents the padded processing grid. ``D`` of Algorithm 1 is ``decode``.
+Maps cover the pixels of the image, latents the padded processing grid.
 """
 
 from __future__ import annotations
@@ -100,10 +100,7 @@ def _latent_of(vae: Any) -> tuple[int | None, int | None]:
 
 
 def tiny_autoencoder(pipe: Any, decoder: str) -> AutoencoderTiny | None:
-    """The autoencoder for the loop, on the pipeline's device and of its dtype, frozen; ``None`` for its own.
-
-    ``decoder`` is that of ``GuidanceConfig``; what cannot decode the pipeline's latent is an ``InputError``.
-    """
+    """The autoencoder that ``decoder`` of ``GuidanceConfig`` names, frozen; ``None`` for the prior's own."""
     if decoder == FULL:
         return None
     vae: Any = getattr(pipe, "vae", None)
@@ -137,13 +134,8 @@ def _loaded(name: str, dtype: torch.dtype, device: str) -> AutoencoderTiny:
 class StepEstimate:
     """One denoising step's estimate, as ``algorithm.step`` guides it.
 
-    Args:
-        codec: between latents and maps.
-        level: signal and noise of the step.
-        output: ``(B, C, h, w)`` the network's, all channels, in the pipeline's precision, as ``z_t``.
-        z_t: the noisy latent.
-        tap: of the network for the full gradient; ``None`` where guidance moves the clean latent.
-        latent_is_read: another step follows, or the user asked for the latent; else a last map needs no code.
+    Of the network's output and z_t, ``(B, C, h, w)`` each, all channels, in the pipeline's precision. Without
+    a ``tap`` guidance moves the clean latent. Unless ``latent_is_read`` a last map needs no code.
 
     Attributes:
         latent: ``(B, c, h, w)`` float32, what guidance moves: z_t ("full") or z0_hat ("denoised").

@@ -65,10 +65,7 @@ def networks_of(pipe: Any) -> list[torch.nn.Module]:
 
 
 def images_in_float32(processor: Any) -> AbstractContextManager[None]:
-    """An image processor's ``preprocess`` reads and resizes in float32, and casts last.
-
-    There are no kernels for half precision on a CPU, and float16 has no white of a 16-bit image.
-    """
+    """An image processor reads and resizes in float32: float16 has no white of a 16-bit image."""
     stock = processor.preprocess
 
     def preprocess(
@@ -85,11 +82,7 @@ def images_in_float32(processor: Any) -> AbstractContextManager[None]:
 
 
 class Exclusive:
-    """What a call holds: its pipeline; a guided one also the pipeline's networks, and ``WithinCores``.
-
-    So a guided call changes no pipeline whose stock call runs in another thread, and two pipelines that share
-    networks are not guided at once. Stock calls of other pipelines are not held up. A thread may enter again.
-    """
+    """What a call holds against other threads: its pipeline; a guided one also networks, and the cores."""
 
     def __init__(self, pipe: Any, guided: bool) -> None:
         owners = [pipe, *networks_of(pipe)] if guided else [pipe]
@@ -204,14 +197,8 @@ class GuidedScheduler:
     holds on to it; all its attributes are put back. ``step`` gets the timesteps on the CPU, where diffusers
     keeps the tables that they index: looked up on another device, each would be waited for.
 
-    Args:
-        pipe: the live pipeline.
-        on_trajectory: called at ``set_timesteps`` with the timesteps; Marigold does so for every chunk.
-        on_step: ``(model_output, timestep, z_t) -> (model_output, z_t, shift)``: what the scheduler's own
-            step shall be given, and what to add to its ``z_{t-1}`` (``None`` for nothing).
-        on_done: ``(timestep, z_{t-1}) -> z_{t-1}``, after the step.
-        respace: run a leading DDIM as trailing.
-        skipped: steps at the beginning of the schedule of a DDIM that are left out.
+    ``on_step`` gives what the scheduler's own step takes, and what to add to its ``z_{t-1}``; ``respace``
+    runs a leading DDIM as trailing, whose first ``skipped`` steps are left out.
     """
 
     def __init__(

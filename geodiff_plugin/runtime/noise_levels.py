@@ -1,7 +1,4 @@
-"""Noise level of a live scheduler at a timestep, one function per family.
-
-A new scheduler is one line in ``FAMILIES``; everything else goes through the scheduler's own ``step``.
-"""
+"""Noise level of a live scheduler at a timestep, one function per family; a new one is a line there."""
 
 from __future__ import annotations
 
@@ -66,10 +63,7 @@ FAMILIES: dict[type, Callable[[Any, Tensor], NoiseLevel]] = {
 
 
 def noise_level(scheduler: Any, timestep: Tensor) -> NoiseLevel:
-    """Signal and noise level that the scheduler's next ``step`` assumes.
-
-    ``timestep`` is a 0-d tensor out of ``scheduler.timesteps``. Raises ``InputTypeError`` if no family fits.
-    """
+    """Signal and noise level that the scheduler's next ``step`` assumes, at a 0-d ``timestep`` of its own."""
     return _family(scheduler)(scheduler, timestep)
 
 

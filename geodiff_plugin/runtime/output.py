@@ -1,8 +1,4 @@
-"""From decoded maps to ``MetricDepthOutput``: ensembles reduced, maps finished, confidence and verdict.
-
-Ensembles are of metric maps (S5.1): median and median absolute deviation, without alignment. Marigold's own
-``ensemble_depth`` renormalises to [0, 1], which would lose the metres.
-"""
+"""From decoded maps to ``MetricDepthOutput``: ensembles (S5.1), maps finished, confidence, verdict."""
 
 from __future__ import annotations
 
@@ -79,10 +75,7 @@ def _finish_images(run: GuidedRun, depth_m: Tensor, lefts: Tensor) -> tuple[Tens
 
 
 def _spread_of_members(run: GuidedRun, depth_m: Tensor, lefts: Tensor, call: Mapping[str, Any]) -> Tensor:
-    """How far the members of every ensemble, finished one by one, lie from its result: ``(N, 1, H, W)`` m.
-
-    It costs a fit per member: their spread before it is that of a map that is not given out.
-    """
+    """How far the members of every ensemble, finished one by one, lie from its result: ``(N, 1, H, W)`` m."""
     size, method = image_size(depth_m), call["resample_method_output"]
     reduction = (call["ensembling_kwargs"] or {}).get("reduction", "median")
     spreads = []
@@ -132,20 +125,20 @@ def assemble_output(
     call: Mapping[str, Any],
     warned: Mapping[str, bool],
 ) -> MetricDepthOutput:
-    """Everything of ``MetricDepthOutput`` but ``latent``.
+    """Everything of ``MetricDepthOutput`` but ``latent``, of the stock call's output, tensors in metres.
 
-    ``stock`` is the output of the stock call, already in metres, and ``call`` its arguments by name;
-    ``warned`` has the warnings so far, and whether each forbids trust.
+    ``call`` are the user's arguments by name; ``warned`` has the warnings so far, and whether each forbids
+    trust.
     """
     natives = [evidence.native_left for evidence in run.evidence]
     # A single large picture is not copied.
     lefts_01 = natives[0][None] if len(natives) == 1 else torch.stack(natives)
     count, size, has_unit = len(natives), image_size(lefts_01), guidance.unit is not None
-    depth_m = run.within_range(_as_maps(stock.prediction).to(lefts_01.device))  # or the processing grid
+    depth_m = run.within_range(stock.prediction.float().to(lefts_01.device))  # or the processing grid
     grid = image_size(depth_m)
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
     depth_m, support = _finish_images(run, depth_m, lefts)
-    uncertainty = None if stock.uncertainty is None else _as_maps(stock.uncertainty).to(depth_m)
+    uncertainty = None if stock.uncertainty is None else stock.uncertainty.to(depth_m)
     if uncertainty is not None and support is not None:
         uncertainty = _spread_of_members(run, depth_m, lefts, call)
     Ks = torch.stack([torch.as_tensor(i.K_left, device="cpu").float() for i in guidance.inputs]).to(depth_m)
@@ -194,7 +187,7 @@ def assemble_output(
         K=K if call["output_type"] == "pt" else K.cpu().numpy(),
         history=[report for t in run.trajectories for report in t.history],
         poses=[evidence.pose for evidence in run.evidence if evidence.pose is not None],
-        extras=getattr(stock, "extras", {}),
+        extras={name: out(extra) for name, extra in getattr(stock, "extras", {}).items()},
         verdicts=verdicts,
         unit=guidance.unit,
         warnings=[
@@ -301,13 +294,6 @@ def _indicators(
         on_edge=any(t.on_edge is not None and bool(t.on_edge[i]) for t, i in samples),
         **more,
     )
-
-
-def _as_maps(values: Any) -> Tensor:
-    """``(N, 1, H, W)`` float32 of what the pipeline gives, numpy or torch."""
-    if isinstance(values, Tensor):
-        return values.float()
-    return torch.from_numpy(values).permute(0, 3, 1, 2).float()
 
 
 def _warnings(run: GuidedRun, visible: Tensor | None, verdicts: Sequence[Verdict]) -> list[str]:

@@ -34,10 +34,7 @@ _Stock: Any = MarigoldDepthPipeline if TYPE_CHECKING else object
 
 
 class GuidedCall(_Stock):
-    """Mixin for a pipeline class: a ``__call__`` that takes ``guidance``, and metric ensembling while guided.
-
-    It comes before the stock class, whose call does all the rest: preprocessing, latents, loop, resizing.
-    """
+    """Mixin before a stock class: ``__call__`` takes ``guidance``, and ensembling is metric while guided."""
 
     _guided_run: GuidedRun | None = None
 
@@ -55,13 +52,13 @@ class GuidedCall(_Stock):
 
         Args:
             image: left image(s), as the stock call takes them; guided, all that ``right`` takes as well.
-            *args: as the stock call takes them, as ``kwargs``.
+            *args: as the stock call takes them.
             guidance: the second view; ``None`` is the stock call, bit for bit.
             callback_on_step_end: ``f(pipe, i, t, {"latents", "metric_depth", "loss", "scale", "shift"})``;
                 ``latents`` in what it returns replace the pipeline's. The others are those of the last step
                 that was corrected or updated, and ``None`` before the first.
             strict: a depth that is not trusted, or not judged (``output.verdict``), is an error.
-            **kwargs: see above.
+            **kwargs: likewise.
 
         Returns:
             ``MetricDepthOutput``, or with ``return_dict=False`` the stock tuple (prediction, uncertainty,
@@ -124,12 +121,11 @@ class GuidedCall(_Stock):
         # Channels last, as the stock call reads pictures; beside latents Marigold takes none such.
         layout = torch.channels_last if call["latents"] is None else torch.contiguous_format
         call["image"] = lefts_01.contiguous(memory_format=layout)
-        run = GuidedRun(
-            self, prior, guidance, evidence, call, grid, rounds, callback, tiny=tiny, held=held, warm=warm
-        )
+        run = GuidedRun(self, prior, guidance, evidence, call, grid, rounds, callback, tiny, held, warm)
         try:
             with run:
-                stock = super().__call__(**{**call, "return_dict": True, "output_latent": True})
+                told = {"return_dict": True, "output_latent": True, "output_type": "pt"}
+                stock = super().__call__(**call | told)
         finally:
             run.release()
         run.check_finite()

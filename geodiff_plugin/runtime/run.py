@@ -34,11 +34,9 @@ StepCallback = Callable[[Any, int, Any, dict[str, Tensor | None]], dict[str, Ten
 
 
 class GuidedRun:
-    """State of one guided call.
+    """State of one guided call, whose stock arguments are ``call``, with ``rounds`` in each denoising step.
 
-    ``evidence`` has one entry per image, ``call`` the arguments of the stock call by name, ``rounds`` are
-    those of each denoising step; ``tiny`` is an autoencoder for the loop, ``held`` a lock against calls in
-    other threads, released while the ``callback`` runs; ``warm`` is the start from the previous frame.
+    ``held`` is released while the ``callback`` runs.
     """
 
     def __init__(
@@ -122,9 +120,7 @@ class GuidedRun:
         """Metric depth ``(B, 1, H, W)`` of the next chunk of final latents, on the padded processing grid."""
         chunk = len(self.relative)
         trajectory, x = self.trajectories[chunk], self._results[chunk]
-        if (
-            x is None
-        ):  # else as it was encoded: decoding adds the autoencoder's loss and the scheduler's noise
+        if x is None:  # else as it was encoded: decoding adds the autoencoder's loss, and noise
             x = self.prior.decode(latents[:, self.prior.depth_channels]).float()
         x = self.grid.padded(x)
         self.relative.append(self.grid.cropped(x))
@@ -150,10 +146,9 @@ class GuidedRun:
         return [(t, i) for t in self.trajectories for i, owner in enumerate(t.owners) if owner == image]
 
     def kept_and_error(self, image: int, member: int | None = None) -> tuple[Tensor | None, Tensor | None]:
-        """What the first estimates say of one image's matches, of one member or in the mean of all.
+        """By one member or the mean of all, ``(1, 1, h, w)`` each, ``None`` where not measured.
 
-        ``(1, 1, h, w)``, the share of each match's confidence that remains once reflections are rejected, and
-        the prior's error in log depth, as ``correction.local_error`` gives it; ``None`` where not measured.
+        The share of each match's confidence that remains without reflections, and the ``local_error``.
         """
         samples = self.samples_of(image)
         chosen = samples if member is None else samples[member : member + 1]
@@ -166,10 +161,9 @@ class GuidedRun:
 
     def prior_error(self) -> Tensor | None:
         """Error of the prior in log depth; ``None`` unless ``kept_and_error`` has it for every image."""
-        errors = [
-            error for i in range(len(self.evidence)) if (error := self.kept_and_error(i)[1]) is not None
-        ]
-        return torch.cat(errors) if len(errors) == len(self.evidence) else None
+        errors = [self.kept_and_error(i)[1] for i in range(len(self.evidence))]
+        known = [error for error in errors if error is not None]
+        return torch.cat(known) if len(known) == len(errors) else None
 
     def check_finite(self) -> None:
         """Raise ``InputError`` on the first tensor of the loop that was not finite; once, after the loop."""
@@ -197,14 +191,9 @@ class GuidedRun:
         self._results.append(None)
         self._step, self._timesteps, self._shown = 0, timesteps.tolist(), None
         if self.schedule is None:
-            self.schedule = make_schedule(
-                self.config,
-                plan,
-                len(timesteps),
-                rounds=self._rounds,
-                skipped=self._skipped,
-                encodes=self._tap is None,
-            )
+            times = {"rounds": self._rounds, "skipped": self._skipped}
+            encodes = self._tap is None
+            self.schedule = make_schedule(self.config, plan, len(timesteps), encodes=encodes, **times)
             options = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
             chunks = -(-len(self.owners) // self.batch_size)
             self._bar = tqdm(total=chunks * len(timesteps), **options)

@@ -1,8 +1,4 @@
-"""What a call starts from beside noise: the previous frame's latent and scale, or a dense depth prompt.
-
-The start in the middle of the schedule is SDEdit's (Meng et al. 2022), of another frame's result. Depth
-prompts are for priors such as Prompt Depth Anything (arXiv 2412.14015), which takes a phone's sparse lidar.
-"""
+"""What a call starts from beside noise: the previous frame (as SDEdit, Meng et al. 2022), a depth prompt."""
 
 from __future__ import annotations
 
@@ -47,9 +43,8 @@ def plan_warm_start(
 ) -> WarmStart | None:
     """The start that ``guidance.previous`` gives to a call on a padded grid ``size``; ``None`` without it.
 
-    The latent is taken over by a DDIM of two steps or more. Other schedulers, and priors of a single step,
-    take over the scale alone. ``InputError`` for an output of another number of images or members, of a prior
-    of another space, or of another size; and for ``latents`` of another shape than the output's.
+    The latent is taken over by a DDIM of two steps or more. Others take over the scale alone. ``InputError``
+    for an output of other images, members or size, or of a prior of another space.
     """
     previous = guidance.previous
     if previous is None:
@@ -107,11 +102,7 @@ def _counted(images: int, members: int) -> str:
 
 
 def depth_prompt(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor | None:
-    """Confident matches and points, spread along surfaces, for priors that take a depth prompt.
-
-    ``(N, 1, h, w)`` metres: flat maps corrected by both, as a prior's would be; ``None`` if an image has
-    neither.
-    """
+    """``(N, 1, h, w)`` metres: flat maps corrected by matches and points; ``None`` if one has neither."""
     maps = []
     for image in evidence:
         confident, points = Matches.stack([image.reliable]), Matches.stack([image.points])

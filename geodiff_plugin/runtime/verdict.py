@@ -1,7 +1,6 @@
 """Whether a result can be trusted, and if not, why: indicators of a run, and a verdict on them.
 
-No indicator shows everything: a rectified pair with a wrong focal length, or with a baseline that is wrong by
-a factor that a rig might have, matches as well as a right one.
+A rectified pair with a wrong focal length, or a likely but wrong baseline, matches as well as a right one.
 """
 
 from __future__ import annotations
@@ -186,11 +185,10 @@ def read_indicators(
     has_unit: bool = True,
     **more: Any,
 ) -> Indicators:
-    """The indicators of one image, of the result ``depth_m (1, H, W)`` in the unit of the poses.
+    """The indicators of one image, of the result ``depth_m (1, H, W)``, and ``more`` that are known already.
 
     ``K_left`` is in pixels of the native image; ``range_given``: the user gave the range of the search;
-    ``has_unit``: lengths are in metres, so that the length of a baseline means something; ``more`` are
-    indicators that do not follow from these.
+    ``has_unit``: lengths are in metres, so that the length of a baseline means something.
     """
     matches, pose, rights = evidence.matches, evidence.pose, evidence.native_views
     if matches is not None:
