@@ -285,10 +285,9 @@ class GuidedDenoiseLoop(DenoiseLoop):
 
 
 def _at_image_size(processor: Any, values: torch.Tensor, block_state: Any) -> Any:
-    """``(1, H, W, 1)`` array of a map ``(1, 1, h, w)``, unpadded and resized to the image."""
+    """A map ``(1, 1, h, w)``, unpadded and resized to the image."""
     values = processor.unpad_image(values, block_state.padding)
-    resized = processor.resize_antialias(values, block_state.original_resolution, "bilinear", is_aa=False)
-    return processor.pt_to_numpy(resized)
+    return processor.resize_antialias(values, block_state.original_resolution, "bilinear", is_aa=False)
 
 
 class DecodeStep(Block):
@@ -303,7 +302,7 @@ class DecodeStep(Block):
         vae, processor = components.vae, components.image_processor
         decoded = vae.decode(block_state.latents / vae.config.scaling_factor, return_dict=False)[0]
         map_01 = (torch.clip(decoded.mean(dim=1, keepdim=True), -1.0, 1.0) + 1.0) / 2.0
-        block_state.relative_depth = _at_image_size(processor, map_01, block_state)
+        block_state.relative_depth = processor.pt_to_numpy(_at_image_size(processor, map_01, block_state))
 
 
 class GeometryEvidenceStep(Block):

@@ -86,7 +86,6 @@ class GeometryGuidance:
     Source: Algorithm 1, S4.2, S5.1; docs/reference/knobs.md explains defaults of our own.
     """
 
-    #: Cameras estimated by ``from_photographs``; ``None`` where poses were given.
     estimated: EstimatedRig | None = None
 
     def __init__(

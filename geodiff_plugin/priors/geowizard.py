@@ -66,12 +66,10 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         super().__init__()
         parts = {"image_encoder": image_encoder, "text_encoder": text_encoder, "tokenizer": tokenizer}
         needed = {IMAGE_EMBEDDING: ["image_encoder"], TEXT_PROMPT: ["text_encoder", "tokenizer"]}
-        width = unet.config.projection_class_embeddings_input_dim
-        if width not in needed:
-            bad_value("the U-Net's class embedding", "10 (GeoWizard v1) or 4 (v2) numbers wide", width)
-        if any(parts[name] is None for name in needed[width]):
-            bad_value("components", f"with {' and '.join(needed[width])} for this U-Net", "None")
-        couple_pairs(unet)
+        wanted = needed.get(unet.config.projection_class_embeddings_input_dim)
+        if wanted is None or any(parts[name] is None for name in wanted):
+            got = [name for name, part in parts.items() if part is not None]
+            bad_value("components", f"a U-Net of GeoWizard v1 or v2 with {wanted}", got)
         defaults = prediction_type, default_denoising_steps, default_processing_resolution
         domain = check_choice(default_domain, "default_domain", DOMAINS)
         modules = {"unet": unet, "vae": vae, "scheduler": scheduler, **parts}
@@ -178,4 +176,6 @@ def couple_pairs(unet: UNet2DConditionModel) -> None:
 
 
 def _unet_folder(layout: Layout) -> str:
-    return "unet" if layout.has("unet") or not layout.has(UNET_V2) else UNET_V2
+    """The authors' folder of v2 where it is the only one."""
+    both = ((layout.folder / name).exists() for name in ("unet", UNET_V2))
+    return UNET_V2 if tuple(both) == (False, True) else "unet"

@@ -95,10 +95,6 @@ class Layout:
         prefix = f"{component}/" if component else ""
         return self.read_json(f"{prefix}config.json") or self.read_json(f"{prefix}scheduler_config.json")
 
-    def has(self, component: str) -> bool:
-        """Whether there is such a subfolder (or file)."""
-        return (self.folder / component).exists()
-
     @cached_property
     def licence(self) -> str:
         """``license:`` of the model card's front matter, or ``"licence unknown"``."""
@@ -224,7 +220,7 @@ def build_pipeline(cls: type[Any], layout: Layout, dtype: torch.dtype, **options
         is_component = isinstance(entry, list) and entry[0] is not None
         if name in arguments:
             continue
-        if is_component or (name in annotated and layout.has(name)):
+        if is_component or (name in annotated and (layout.folder / name).exists()):
             arguments[name] = load_component(layout, name, _component_class(cls, layout, name), dtype)
         elif entry is not None and not isinstance(entry, list):
             arguments[name] = entry

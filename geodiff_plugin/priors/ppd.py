@@ -136,7 +136,6 @@ class _Block(nn.Module):
 class PixelDiT(ModelMixin, ConfigMixin):
     """Cascaded diffusion transformer: half of the blocks on patches of twice the size, half on patches."""
 
-    _supports_gradient_checkpointing = True
     _no_split_modules = ["_Block"]
 
     @register_to_config
@@ -150,7 +149,6 @@ class PixelDiT(ModelMixin, ConfigMixin):
         mlp_ratio: float = 4.0,
     ) -> None:
         super().__init__()
-        self.gradient_checkpointing = False
         self.x_embedder = nn.ModuleDict({"proj": nn.Conv2d(4, hidden_size, 2 * patch_size, 2 * patch_size)})
         of_time = nn.Linear(TIME_FREQUENCIES, hidden_size), nn.SiLU(), nn.Linear(hidden_size, hidden_size)
         self.t_embedder = nn.ModuleDict({"mlp": nn.Sequential(*of_time)})
@@ -177,23 +175,16 @@ class PixelDiT(ModelMixin, ConfigMixin):
         coarse, fine = (_rotations(rows * k, columns * k, head_size, tokens) for k in (1, 2))
         middle = len(self.blocks) // 2
         for block in self.blocks[:middle]:
-            tokens = self._run(block, tokens, time, coarse)
+            tokens = block(tokens, time, coarse)
         tokens = self.proj_fusion(torch.cat([tokens, F.normalize(semantics, dim=-1)], dim=-1))
         # Every coarse token, 4 D wide now, becomes the four fine ones of its patch, two by two.
         tokens = tokens.unflatten(2, (2, 2, -1)).unflatten(1, (rows, columns))  # (B, h, w, 2, 2, D)
         tokens = tokens.permute(0, 1, 3, 2, 4, 5).flatten(1, 4)  # (B, 4 n, D)
         for block in self.blocks[middle:]:
-            tokens = self._run(block, tokens, time, fine)
+            tokens = block(tokens, time, fine)
         shift_and_scale = self.final_layer["adaLN_modulation"](time).chunk(2, dim=1)
         pixels = self.final_layer["linear"](_modulated(tokens, *shift_and_scale))  # (B, 4 n, patch^2)
         return F.pixel_shuffle(pixels.transpose(1, 2).unflatten(2, (2 * rows, 2 * columns)), patch)
-
-    def _run(
-        self, block: nn.Module, tokens: Tensor, time: Tensor, rotations: tuple[Tensor, Tensor]
-    ) -> Tensor:
-        if torch.is_grad_enabled() and self.gradient_checkpointing:
-            return self._gradient_checkpointing_func(block, tokens, time, rotations)
-        return block(tokens, time, rotations)
 
 
 class PPDPipeline(DepthDiffusionPipeline):

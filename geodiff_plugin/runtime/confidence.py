@@ -24,9 +24,6 @@ RIGHT_WITHIN = 0.1
 #: strength, by photometric agreement, by the relative spread of an ensemble (set by hand: members that differ
 #: by 10 % halve the odds twice).
 BY_EVIDENCE = (-0.228, 0.788, 2.42, 0.0864, -15.0)
-#: Which sign each of them may have; 0 for any. Agreement can only raise confidence, and a pixel that no right
-#: camera sees has none, so not being in view can never raise it.
-SIGNS = (0, 1, 1, 1, -1)
 # Beyond these photometric errors tell nothing more, nor do errors of the prior as a whole, nor that which is
 # left to a depth: where it is largest many depths are right all the same.
 _LEAST_DIFFERENCE, _MOST_DIFFERENCE = 0.01, 0.1

@@ -53,7 +53,7 @@ def plan_warm_start(
     # Not their product alone: three members of one image are no start for three images.
     given, wanted = tuple(previous.scale.shape), (len(guidance.inputs), call["ensemble_size"])
     if given != wanted:
-        bad_value("previous", f"the output of {_counted(*wanted)}", f"one of {_counted(*given)}")
+        bad_value("previous", "an output of {} images of {} members".format(*wanted), given)
     if previous.space not in (None, prior.space):  # None of one that was put together by hand
         expected = f"the output of a prior whose map is affine in {prior.space}"
         bad_value("previous", expected, f"one in {previous.space}", "Use one prior for a whole sequence.")
@@ -94,11 +94,6 @@ def _noise(z0: Tensor, prior: DepthPrior, call: Mapping[str, Any], device: torch
     if noise.shape != z0.shape:
         bad_value("latents", f"of shape {tuple(z0.shape)}, as those of previous", f"{tuple(noise.shape)}")
     return noise
-
-
-def _counted(images: int, members: int) -> str:
-    """How many samples, in words: ``"2 images of 1 member"``."""
-    return f"{images} image{'s' * (images != 1)} of {members} member{'s' * (members != 1)}"
 
 
 def depth_prompt(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor | None:

@@ -44,8 +44,8 @@ __all__ = [
     "promised",
 ]
 
-#: Which sign each coefficient of ``consistency.LOG_ODDS`` may have; 0 for any.
-MATCH_SIGNS = (0, 1, -1, -1)
+#: Which sign each coefficient of ``consistency.LOG_ODDS``, and of ``BY_EVIDENCE``, may have; 0 for any.
+MATCH_SIGNS, SIGNS = (0, 1, -1, -1), (0, 1, 1, 1, -1)
 
 
 def promised(evidence: np.ndarray, coefficients: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -288,7 +288,7 @@ def main(
         ),
         "depth": (
             observe_depth,
-            ("runtime/confidence.py", "BY_EVIDENCE", confidence.SIGNS, confidence.BY_EVIDENCE),
+            ("runtime/confidence.py", "BY_EVIDENCE", SIGNS, confidence.BY_EVIDENCE),
         ),
     }
     settings = [
