@@ -21,12 +21,6 @@ NOISING_STEPS = 1000
 SIDE = 64
 
 
-def cosine_alpha_bar(time: float) -> float:
-    """Share of the signal's variance at a time in [0, 1] of the cosine schedule."""
-    log_snr = -2.0 * math.log(math.tan(math.pi * time / 2.0) + 1e-5)
-    return 1.0 / (1.0 + math.exp(-log_snr))
-
-
 class DepthFMPipeline(DepthDiffusionPipeline):
     """Log depth by a flow that starts from the image itself, with noise of ``noising_step``, 0 (none) to 999.
 
@@ -78,8 +72,9 @@ class DepthFMPipeline(DepthDiffusionPipeline):
         return self.add_noise(latent, noise)
 
     def add_noise(self, image_latent: Tensor, noise: Tensor) -> Tensor:
-        """Where the flow starts, from an image latent and noise ``(B, 4, h, w)`` each."""
-        alpha_bar = cosine_alpha_bar(self.config.noising_step / NOISING_STEPS)
+        """Where the flow starts, by the cosine schedule, from an image latent and noise ``(B, 4, h, w)``."""
+        log_snr = -2.0 * math.log(math.tan(math.pi * self.config.noising_step / NOISING_STEPS / 2.0) + 1e-5)
+        alpha_bar = 1.0 / (1.0 + math.exp(-log_snr))
         return math.sqrt(alpha_bar) * image_latent + math.sqrt(1.0 - alpha_bar) * noise
 
     def set_timesteps(self, num_inference_steps: int, device: torch.device) -> None:

@@ -31,18 +31,6 @@ def _statistics(vae: AutoencoderKLQwenImage, like: Tensor) -> tuple[Tensor, Tens
     return mean, deviation
 
 
-def frame_of(vae: AutoencoderKLQwenImage, latents: Tensor) -> Tensor:
-    """Normalised latents ``(B, C, h, w)`` to ``(B, 3, 8 h, 8 w)``, float32 or wider, as ``vae.decode``.
-
-    But for its clamp, which has no gradient beyond [-1, 1], where near and far lie.
-    """
-    wide = widened(latents)
-    mean, deviation = _statistics(vae, wide)
-    z = (wide * deviation + mean).to(vae.dtype)[:, :, None]
-    frames = torch.cat([_decode(vae, part) for part in (z.split(1) if vae.use_slicing else (z,))])
-    return frames[:, :, 0].to(wide.dtype)
-
-
 @apply_forward_hook
 def _decode(vae: AutoencoderKLQwenImage, z: Tensor) -> Tensor:
     """``vae._decode`` of one frame, for which nothing is cached; the hook brings an offloaded one back."""
@@ -132,8 +120,12 @@ class MarigoldV2Pipeline(DepthDiffusionPipeline):
         return frames[:, :, 0].to(latents.dtype)
 
     def decode_picture(self, z0: Tensor) -> Tensor:
-        """One frame, not clipped."""
-        return frame_of(self.vae, z0)
+        """One frame, as ``vae.decode`` but for its clamp, which has no gradient where near and far lie."""
+        wide = widened(z0)
+        mean, deviation = _statistics(self.vae, wide)
+        z = (wide * deviation + mean).to(self.vae.dtype)[:, :, None]
+        frames = [_decode(self.vae, part) for part in (z.split(1) if self.vae.use_slicing else (z,))]
+        return torch.cat(frames)[:, :, 0].to(wide.dtype)
 
     def encode_picture(self, picture: Tensor) -> Tensor:
         """Mode of the code of one frame, float32 or wider."""

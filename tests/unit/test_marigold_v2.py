@@ -11,17 +11,17 @@ from examples.fitted_lora import FittedLora, complete_by_lora, draw_points
 from examples.marigold_v2 import tiny_marigold_v2
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.bundled.demo_pair import DemoPair
-from geodiff_plugin.priors.marigold_v2 import frame_of
 from geodiff_plugin.types import Rig
 
 
 def test_a_frame_is_the_librarys_but_for_the_clamp_in_slices_and_tiles_too():
-    vae = tiny_marigold_v2().vae
+    pipe = tiny_marigold_v2()
+    vae = pipe.vae
     z = 4.0 * torch.randn(2, 16, 4, 6, generator=torch.Generator().manual_seed(0))
     shape = (1, 16, 1, 1)
     mean, std = (torch.tensor(v).view(shape) for v in (vae.config.latents_mean, vae.config.latents_std))
     theirs = vae.decode((z * std + mean)[:, :, None]).sample[:, :, 0]
-    ours = frame_of(vae, z.requires_grad_())
+    ours = pipe.decode_picture(z.requires_grad_())
     assert (ours.abs() > 1).any(), "nothing to clip"
     torch.testing.assert_close(ours.clamp(-1, 1), theirs, rtol=0, atol=1e-6)
     beyond = torch.where(ours.abs() > 1, ours, 0.0)
@@ -29,10 +29,10 @@ def test_a_frame_is_the_librarys_but_for_the_clamp_in_slices_and_tiles_too():
     assert gradient.abs().sum() > 0
     with torch.no_grad():
         vae.use_slicing = True
-        torch.testing.assert_close(frame_of(vae, z), ours, rtol=0, atol=1e-4)
+        torch.testing.assert_close(pipe.decode_picture(z), ours, rtol=0, atol=1e-4)
         vae.use_slicing = False
         vae.enable_tiling(16, 16, 8, 8)
-        tiled = frame_of(vae, z)
+        tiled = pipe.decode_picture(z)
     both = torch.stack([tiled.flatten(), ours.detach().flatten()])
     assert tiled.shape == ours.shape and torch.corrcoef(both)[0, 1] > 0.8
 
