@@ -45,25 +45,10 @@ def test_blocks_without_geometry_are_the_stock_pipeline(prior, views):
     np.testing.assert_array_equal(mine, prior(**told, generator=seeded()).prediction)
 
 
-def by_hand():
-    blocks = block.MarigoldBlocks()
-    loop = blocks.sub_blocks["denoise"]
-    loop.sub_blocks.insert("geometry", block.GeometryStep(), 1)
-    loop.sub_blocks.insert("after", block.AfterStep(), 3)
-    blocks.sub_blocks.insert("evidence", block.GeometryEvidenceStep(), 3)
-    blocks.sub_blocks.insert("plan", block.GeometryBeginStep(), 5)
-    blocks.sub_blocks["decode"] = block.MetresStep()
-    return blocks
-
-
-@pytest.mark.parametrize(
-    ("blocks", "knobs"),
-    [(block.GuidedMarigoldBlocks, {}), (block.GuidedMarigoldBlocks, {"inner_steps": 2}), (by_hand, {})],
-)
-def test_blocks_with_geometry_are_the_guided_call(prior, views, textured_plane, blocks, knobs):
-    """Also those that go into a pipeline that had none."""
+@pytest.mark.parametrize("knobs", [{}, {"inner_steps": 2}])
+def test_blocks_with_geometry_are_the_guided_call(prior, views, textured_plane, knobs):
     told = AT_96 | {"knobs": KNOBS | knobs, "prediction_type": prior.config.prediction_type}
-    state = assembled(blocks(), prior)(**views, **told, generator=seeded())
+    state = assembled(block.GuidedMarigoldBlocks(), prior)(**views, **told, generator=seeded())
     out = guided_call(quiet(load_prior("bundled")), textured_plane, KNOBS | knobs, **AT_96)
     np.testing.assert_array_equal(state.get("depth_m"), out.prediction[0, ..., 0])
     np.testing.assert_array_equal(state.get("confidence"), out.confidence[0, ..., 0])

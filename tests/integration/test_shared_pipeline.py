@@ -101,13 +101,6 @@ def test_methods_that_the_user_replaced_are_used_and_kept(pipe, calls):
     np.testing.assert_array_equal(inside[0], plain)
 
 
-def test_a_scheduler_assigned_in_a_callback_stays(pipe, calls):
-    reference, other = calls[1](), SCHEDULERS["dpm"]()
-    found = calls[1](lambda p, *_: setattr(p, "scheduler", other))
-    np.testing.assert_array_equal(found, reference)  # the call goes on with its own
-    assert pipe.scheduler is other and pipe.config["scheduler"][1] == "DPMSolverMultistepScheduler"
-
-
 def test_threads_on_shared_networks_wait_for_each_other(pipe, textured_plane):
     full, twin = {"gradient": "full"}, enable_geometry_guidance(sharing(pipe))
     calls = [*calls_of(pipe, textured_plane, **full), calls_of(twin, textured_plane, **full)[1]]

@@ -10,7 +10,6 @@ import torch
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin import _threads as threads
-from geodiff_plugin.guidance import guidance as guidance_module
 
 #: One core, so that the tests are quick on a machine that is busy: there two threads wait for each other.
 CORES, MORE = 1, 2
@@ -69,15 +68,6 @@ def test_the_number_is_put_back_when_the_call_raises(call, pipe, where):
     with pytest.raises(RuntimeError, match="stopped"):
         call(fails if where == "callback" else None)
     assert torch.get_num_threads() == MORE
-
-
-def test_evidence_outside_of_a_call_stays_within_the_cores(textured_plane, monkeypatch):
-    seen, pair = [], textured_plane
-    watched = Mock(side_effect=lambda *_: seen.append(torch.get_num_threads()))
-    monkeypatch.setattr(guidance_module, "make_evidence", watched)
-    left = torch.from_numpy(pair.left).permute(2, 0, 1)[None].float()
-    GeometryGuidance.paper(pair.right, pair.K, pair.E).prepare(left)
-    assert seen == [CORES] and torch.get_num_threads() == MORE
 
 
 def test_blocks_of_two_threads_do_not_meet():

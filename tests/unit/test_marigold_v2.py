@@ -1,7 +1,5 @@
 """Marigold V2: frames of a video autoencoder, spaces, gradients, corrections that stay, and a fitted LoRA."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -37,58 +35,6 @@ def test_a_frame_is_the_librarys_but_for_the_clamp_in_slices_and_tiles_too():
     assert tiled.shape == ours.shape and torch.corrcoef(both)[0, 1] > 0.8
 
 
-class BlockCode(torch.nn.Module):
-    """An autoencoder of 8 x 8 blocks that keeps their lowest frequencies, shaped as Qwen-Image's."""
-
-    use_slicing = use_tiling = False
-    tile_sample_min_height = tile_sample_min_width = 256
-    dtype, device = torch.float32, torch.device("cpu")
-
-    def __init__(self, kept: int) -> None:
-        super().__init__()
-        k = np.arange(8)
-        cosines = np.cos(np.pi * (2 * k[None] + 1) * k[:, None] / 16)
-        cosines *= np.where(k == 0, 0.5, 2**-0.5)[:, None] / 2
-        self.basis = torch.nn.Parameter(torch.tensor(cosines[:kept] * 2**0.5, dtype=torch.float32))
-        count = kept * kept
-        self.config = SimpleNamespace(latents_mean=[0.1] * count, latents_std=[2.0] * count)
-        self.post_quant_conv = torch.nn.Identity()
-
-    def encode(self, picture):
-        blocks = picture.mean(1)[:, 0].unflatten(1, (-1, 8)).unflatten(3, (-1, 8))  # (B, h, 8, w, 8)
-        z = torch.einsum("bhiwj,ui,vj->buvhw", blocks, self.basis, self.basis).flatten(1, 2)[:, :, None]
-        moments = torch.cat([z, torch.full_like(z, -30.0)], dim=1)
-        return SimpleNamespace(latent_dist=SimpleNamespace(parameters=moments))
-
-    def decoder(self, z):
-        z = z[:, :, 0].unflatten(1, (len(self.basis), -1))
-        grey = torch.einsum("buvhw,ui,vj->bhiwj", z, self.basis, self.basis)
-        return grey.flatten(3).flatten(1, 2)[:, None, None].expand(-1, 3, -1, -1, -1)
-
-
-def wavy_map() -> torch.Tensor:
-    """A slope with ripples of 8 px, as detail of a surface."""
-    rows, columns = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
-    return (0.2 + 0.5 * rows / 64 + 0.05 * torch.sin(columns * 2 * torch.pi / 8))[None, None]
-
-
-@pytest.mark.parametrize("beyond", [0.0, 0.5])
-def test_a_corrected_latent_keeps_the_correction_and_the_detail(beyond):
-    """Also of a map ``beyond`` 1, where the library clamps, and of detail that no code holds."""
-    pipe, x = tiny_marigold_v2(), wavy_map() + beyond
-    pipe.vae = BlockCode(8)
-    torch.testing.assert_close(pipe.decode(pipe.encode(x)), x, rtol=0, atol=1e-5)
-    pipe.vae = BlockCode(4)
-    rows = torch.linspace(0, 1, 64)[:, None].expand(64, 96)[None, None]
-    corrected = x + 0.2 * rows * (1 - rows)
-    kept = pipe.decode(pipe.encode(x))
-    assert (kept - x).abs().max() > 5e-4, "16 channels hold all of it, so that there is nothing to lose"
-    moved = pipe.encode(corrected) - pipe.encode(x)
-    z0 = torch.randn(moved.shape, generator=torch.Generator().manual_seed(0))  # the prior's own, any
-    arrived = pipe.decode(z0 + moved) - pipe.decode(z0)
-    torch.testing.assert_close(arrived, corrected - x, rtol=0, atol=1e-3)
-
-
 def guided(pipe, pair, factor=1.0, **knobs):
     points = np.zeros_like(pair.depth_m)
     points[::4, ::4] = pair.depth_m[::4, ::4] * factor
@@ -102,19 +48,6 @@ def test_points_make_every_space_metric_in_half_precision_too(space, textured_pl
     assert np.median(np.abs(depth_m / textured_plane.depth_m - 1)) < 0.025
     half = guided(tiny_marigold_v2(space=space).to(dtype=torch.bfloat16), textured_plane, inner_steps=1)
     assert half.dtype == np.float32 and np.median(np.abs(half / depth_m - 1)) < 0.003
-
-
-def test_a_guided_call_ends_at_its_points(textured_plane):
-    """By the correction alone: nothing refines the result, no gradient moves it."""
-    errors = {}
-    for correct in (False, True):
-        pipe = tiny_marigold_v2()
-        pipe.vae = BlockCode(4)
-        depth_m = guided(pipe, textured_plane, 1.1, inner_steps=0, crisp=False, correct=correct)
-        truth_m = 1.1 * textured_plane.depth_m
-        errors[correct] = np.abs(depth_m / truth_m - 1)[::4, ::4].mean()
-    # 0.039 and 0.091 were seen: the prior has random weights, and 16 channels do not hold its whole map.
-    assert errors[True] < 0.5 * errors[False] and errors[True] < 0.045
 
 
 @pytest.fixture

@@ -8,10 +8,6 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.algorithm.evidence import prepare_evidence
-from geodiff_plugin.config import DEFAULT
-from geodiff_plugin.runtime.start import PROMPT_LONG_EDGE, depth_prompt
-from geodiff_plugin.types import CameraView
 from tests.contracts.tiny_transformers import make_transformers
 from tests.scenes import render_pair
 
@@ -45,23 +41,6 @@ def test_a_run_says_how_far_the_priors_metres_were_off(kind, textured_plane):
     assert out.own_scale.shape == (1, 1) and float(out.own_scale) == pytest.approx(2.0, rel=0.015)
     assert any("2 times the prior's own metres" in sentence for sentence in out.warnings)
     assert np.median(out.prediction[0, ..., 0] / textured_plane.depth_m) == pytest.approx(1.0, rel=0.01)
-
-
-def evidence_of(pair, points=None, rights=True):
-    def image(x):
-        return torch.from_numpy(x).permute(2, 0, 1) / 255.0
-
-    T, K = torch.tensor(np.linalg.inv(pair.E)).float(), torch.tensor(pair.K).float()
-    views = [CameraView(image(pair.right), K, T)] if rights else []
-    return prepare_evidence(image(pair.left), views, K, points, DEFAULT, rights)
-
-
-def test_matches_become_a_dense_prompt(textured_plane):
-    prompt = depth_prompt([evidence_of(textured_plane)], DEFAULT)
-    assert prompt.shape[:2] == (1, 1) and max(prompt.shape[-2:]) <= PROMPT_LONG_EDGE
-    truth = torch.from_numpy(textured_plane.depth_m)[None, None]
-    truth = torch.nn.functional.interpolate(truth, prompt.shape[-2:], mode="bilinear", antialias=True)
-    assert ((prompt - truth).abs() / truth).median() < 0.015
 
 
 def test_prompt_depth_anything_is_given_what_is_known_unless_it_is_given_depths(textured_plane):

@@ -9,16 +9,12 @@ from diffusers import PNDMScheduler, UNet2DConditionModel
 from diffusers.models.attention_processor import AttnProcessor
 from safetensors.torch import load_file, save_file
 
-from geodiff_plugin import GeometryGuidance
-from geodiff_plugin.algorithm.denoising import noise_from, output_from, z0_from
-from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.priors.components import DirectScheduler, SidesOf
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline
 from geodiff_plugin.priors.geowizard import GeoWizardPipeline, closest_to_mean
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.lotus import LotusPipeline, space_of_name
 from geodiff_plugin.priors.ppd import AreaImageProcessor
-from geodiff_plugin.runtime.noise_levels import check_scheduler, noise_level
 from tests.conftest import make_unet
 from tests.contracts.tiny_priors import (
     make_depthfm,
@@ -59,37 +55,6 @@ def test_sides_of_the_processed_image(processor, size, resolution, grid):
     assert -1 <= image.min() < -0.5 and 0.5 < image.max() <= 1
     fitting = torch.rand(1, 3, 64, 128)
     assert torch.equal(processor.preprocess(fitting, 0)[0], fitting * 2 - 1)
-
-
-def test_a_direct_scheduler_gives_the_output_and_saves(tmp_path):
-    DirectScheduler(timestep=1).save_pretrained(tmp_path)
-    scheduler = DirectScheduler.from_pretrained(tmp_path)
-    assert scheduler.timesteps.tolist() == [1]
-    output, z = torch.randn(1, 4, 2, 2), torch.zeros(1, 4, 2, 2)
-    assert scheduler.step(output, 1, z).prev_sample is output
-    assert scheduler.step(output, 1, z, return_dict=False)[0] is output
-    check_scheduler(scheduler)
-    level = noise_level(scheduler, torch.tensor(1))
-    z0, eps = z0_from(output, z, level), noise_from(output, z, level)
-    assert torch.equal(z0, output) and eps.norm() > 0  # a yardstick for the norm-matched rule
-    assert torch.equal(output_from(z0 + 1, eps, level)[0], output + 1)
-    with pytest.raises(ValueError, match="num_inference_steps must be 1"):
-        scheduler.set_timesteps(4)
-
-
-@pytest.mark.parametrize(
-    ("most", "asked", "default", "planned"),
-    [
-        (None, None, 1, (4, 1)),
-        (None, 2, 10, (2, 1)),
-        (1, None, 1, (1, 4)),
-        (1, 1, 1, (1, 1)),
-        (3, None, 3, (3, 2)),
-    ],
-)
-def test_plan_of_steps_and_rounds(textured_plane, most, asked, default, planned):
-    guidance = GeometryGuidance(textured_plane.right, textured_plane.K, textured_plane.E, min_steps=4)
-    assert count_steps(guidance.denoising_steps(asked, default), asked, most) == planned
 
 
 @pytest.mark.parametrize("make", [make_geowizard, make_depthfm])
@@ -190,6 +155,7 @@ def test_relatives_are_told_apart(tmp_path):
     ("call", "sentence"),
     [
         (lambda: make_depthfm(noising_step=1000), "noising_step"),
+        (lambda: DirectScheduler().set_timesteps(4), "num_inference_steps must be 1"),
         (lambda: make_depthfm()(IMAGE, ensemble_size=1, output_uncertainty=True), "ensemble_size must be"),
         (lambda: make_geowizard()(IMAGE, domain="underwater"), "domain must be one of"),
         (lambda: make_depthmaster()(IMAGE, latents=torch.zeros(1, 4, 2, 2)), "latents must be of shape"),
@@ -225,10 +191,6 @@ def test_geowizards_normals_are_unit_vectors_of_one_member():
     normals = output.extras["normals"]
     assert normals.shape == (1, 44, 60, 3)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1.0, atol=1e-2)
-    with torch.no_grad():
-        members = [pipe.decode_extras(latent[None], 1)["normals"][0] for latent in output.latent]
-    at_size = [member.permute(1, 2, 0)[:44, :60] for member in members]
-    assert any(np.allclose(member, normals[0], atol=1e-6) for member in at_size)
     towards = torch.tensor([[0.0, 0.0, -1.0], [0.1, 0.0, -1.0], [1.0, 0.0, 0.0]])
     vectors = torch.nn.functional.normalize(towards, dim=1)[:, :, None, None].expand(3, 3, 4, 5)
     assert torch.equal(closest_to_mean(vectors)[0], vectors[1])

@@ -115,14 +115,6 @@ def test_a_space_that_the_user_says_wins_and_an_unknown_class_needs_one():
             echo("GLPN", space)
 
 
-def test_depth_pro_gives_inverse_metres_by_its_own_field_of_view():
-    camera = Echo(field_of_view=torch.tensor([90.0]))  # width over focal length is 2
-    pipe = echo("DepthPro", "disparity", camera, size=16)
-    values = pipe.predict(torch.full((1, 3, 16, 16), 0.25), (16, 16))
-    torch.testing.assert_close(values, torch.full_like(values, 0.5))
-    torch.testing.assert_close(pipe.metres(values), torch.full_like(values, 2.0))
-
-
 def test_missing_weights_are_listed_but_for_those_that_nothing_reads(tmp_path):
     pipe, file = make_transformers("dpt"), tmp_path / "model.safetensors"
     pipe.model.save_pretrained(tmp_path)

@@ -160,15 +160,3 @@ def test_rises_with_support_and_falls_with_error_and_spread(support, error, spre
     assert (way * found.diff() > 0).all() and found.min() > 0 and found.max() < 1
     unseen = depth_confidence(_maps(*support), _maps(*error), ~SEEN, None).flatten()
     assert len(set(support)) > 1 or unseen[0] == unseen[2]
-
-
-def test_a_good_prior_is_believed_beside_its_matches_and_not_far_from_them():
-    support, error = _maps(0.0, 0.01, 0.5, 1.0), _maps(0.05, 0.05, 0.05, 0.05)
-    seen = torch.ones_like(support).bool()
-    good, poor = (
-        depth_confidence(support, error, seen, None, torch.full((1, 1, 1, 1), own)).flatten()
-        for own in (0.02, 0.4)
-    )
-    assert bool((good >= poor).all()) and good[2] > poor[2] + 0.2 and good[3] > poor[3]
-    # Its error is measured where matches are: it says nothing of what is far from all of them.
-    assert good[0] == poor[0] and good[1] < 0.6
