@@ -73,10 +73,6 @@ def _number(default: float | None, low: float, high: float, kind: type = float, 
     )
 
 
-def _integer(default: int | None, low: int, high: int, **more: str) -> Any:
-    return _number(default, low, high, int, **more)
-
-
 def _flag(default: bool, **more: str) -> Any:
     return _knob(default, "bool", check_flag, **more)
 
@@ -205,10 +201,10 @@ class GuidanceConfig:
 
     gradient: str = _choice("denoised", "full")
     weights: Mapping[str, float] = _weights(DEFAULT_WEIGHTS)
-    min_steps: int = _integer(4, 1, 1000, paper="{}, not given")
+    min_steps: int = _number(4, 1, 1000, int, paper="{}, not given")
     respace: bool = _flag(True)
     warm_start: float = _number(0.25, 0.0, 0.99, paper="-")
-    sweep_pixels: int = _integer(210_000, 1024, 1 << 32, paper="{} (768 px, S9)")
+    sweep_pixels: int = _number(210_000, 1024, 1 << 32, int, paper="{} (768 px, S9)")
     depth_range: tuple[float, float] | None = _pair(
         None, paper="-", unset="from the nearest plane to a shift of 0.3 px"
     )
@@ -216,20 +212,20 @@ class GuidanceConfig:
     clean_photographs: bool = _flag(True)
     decoder: str = _text("full", "`full`, `tiny`, a folder or a hub id", paper="-")
     eta: float = _number(0.85, 0, 1, paper="{}, not given")
-    pyramid_levels: int = _integer(3, 1, 10)
+    pyramid_levels: int = _number(3, 1, 10, int)
     exposure: bool = _flag(True)
     z_test: bool = _flag(True)
     min_visible: float = _number(0.1, 0, 1)
     pull_to: str = _choice("start", "zero")
     points_loss: str = _choice("robust", "l1l2", paper="-")
-    planes: int = _integer(160, 24, 4096, paper="-")
+    planes: int = _number(160, 24, 4096, int, paper="-")
     search: str = _choice("volume", "one-number", "points-range")
     positive: str = _choice("softplus", "square")
     g_s_range: tuple[float, float] = _pair((1.0, 80.0))
-    g_s_candidates: int = _integer(80, 2, 100_000, paper="{}, not given")
+    g_s_candidates: int = _number(80, 2, 100_000, int, paper="{}, not given")
     reject_reflections: bool = _flag(True)
     correct: bool = _flag(True)
-    corrections: int = _integer(2, 1, 10_000, paper="-")
+    corrections: int = _number(2, 1, 10_000, int, paper="-")
     even_ensemble: str = _choice("mean", "lower", paper="-")
     crisp: bool = _flag(True)
     smoothness: float = _number(40.0, TINY, 1e6, paper="-")
@@ -238,7 +234,7 @@ class GuidanceConfig:
     rule: str = _text("adam", "key of `RULES`")
     step_latents: float | None = _number(None, 0, 1e6, unset="0.03 after a correction, else 0.1")
     step_affine: float = _number(0.01, 0, 1e6)
-    inner_steps: int | None = _integer(None, 0, 10_000, unset="0 after a correction, else 40")
+    inner_steps: int | None = _number(None, 0, 10_000, int, unset="0 after a correction, else 40")
     optimize_latents: bool = _flag(True)
     start: float = _number(0.0, 0, 1)
     stop: float = _number(1.0, 0, 1)

@@ -50,10 +50,7 @@ CURE = "Is a file of it cut off, or of another version? Save or fetch the folder
 
 @contextmanager
 def reading(what: str, expected: str, got: str, cure: str) -> Iterator[None]:
-    """Turn what a library raises over a damaged, foreign or absent file into the sentence of ``bad_value``.
-
-    To ``got`` the library's own first line is added.
-    """
+    """Turn what a library raises over a bad file into the sentence of ``bad_value``, with its first line."""
     try:
         yield
     except Exception as error:  # libraries raise nearly everything
@@ -179,8 +176,7 @@ def load_component(
 ) -> Any:
     """One component of a subfolder (``""``: the folder); a module's weights are checked name by name.
 
-    ``unread`` is part of the names of weights that may be missing, since no forward reads them; weights left
-    over do not matter then either, as in files that users of transformers published.
+    With ``unread``, part of the names of weights that no forward reads, those may lack, and any be left over.
     """
     folder = str(layout.folder / name)
     damaged = reading(f"component {name or 'model'!r} of {layout.name}", "one that can be read", folder, CURE)

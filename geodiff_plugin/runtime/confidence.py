@@ -67,9 +67,8 @@ def depth_confidence(
 ) -> Tensor:
     """Probability ``(B, 1, H, W)`` that a depth is within 10 % of the truth.
 
-    ``support`` is that of ``refine_depth``, ``error`` the photometric one in [0, 1], ``spread`` the relative
-    one of an ensemble's members or ``None``, ``prior_error`` ``(B, 1, 1, 1)`` or a ``local_error`` on any
-    grid; ``None``, unknown, counts as useless.
+    By the support of ``refine_depth``, the photometric error, the relative spread of an ensemble's members,
+    and a ``local_error`` of the prior on any grid, which counts as useless where it is ``None``.
     """
     weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
     confidence = torch.empty_like(support)
@@ -103,10 +102,9 @@ def expected_error(depth_m: np.ndarray, K_left: np.ndarray, poses: Sequence[np.n
 def reprojection(
     views: Sequence[CameraView], depth_m: Tensor, left_01: Tensor, K_left: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Where any right view sees the pixel, and the least mean absolute error to the re-rendered left image.
+    """Where any native right view sees the pixel, and the least error to the re-rendered left image.
 
-    ``depth_m (1, 1, H, W)`` metres and ``left_01 (1, 3, H, W)`` lie on one grid, ``views`` are native. ``(1,
-    1, H, W)`` bool and float in [0, 1], in the left image's exposure, 0 where no view sees the pixel.
+    ``(1, 1, H, W)`` bool and float in [0, 1], in the left image's exposure, 0 where no view sees the pixel.
     """
     best, visible = torch.full_like(depth_m, torch.inf), torch.zeros_like(depth_m, dtype=torch.bool)
     for image, K_right, T in views:

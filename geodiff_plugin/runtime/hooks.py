@@ -197,21 +197,12 @@ class GuidedScheduler:
     holds on to it; all its attributes are put back. ``step`` gets the timesteps on the CPU, where diffusers
     keeps the tables that they index: looked up on another device, each would be waited for.
 
-    ``on_step`` gives what the scheduler's own step takes, and what to add to its ``z_{t-1}``; ``respace``
-    runs a leading DDIM as trailing, whose first ``skipped`` steps are left out.
+    ``run`` is a ``GuidedRun``, whose ``guide`` gives what the scheduler's own step takes, and what to add to
+    its ``z_{t-1}``; ``respace`` runs a leading DDIM as trailing, whose first ``skipped`` steps are left out.
     """
 
-    def __init__(
-        self,
-        pipe: Any,
-        on_trajectory: Callable[[Tensor], None],
-        on_step: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor | None]],
-        on_done: Callable[[Tensor, Tensor], Tensor],
-        respace: bool,
-        skipped: int = 0,
-    ) -> None:
-        self._pipe, self._respace, self._skipped = pipe, respace, skipped
-        self._on_trajectory, self._on_step, self._on_done = on_trajectory, on_step, on_done
+    def __init__(self, pipe: Any, run: Any, respace: bool, skipped: int) -> None:
+        self._pipe, self._run, self._respace, self._skipped = pipe, run, respace, skipped
         original = pipe.scheduler
         is_patched = any(name in vars(original) for name in ("set_timesteps", "step"))
         self._scheduler = original if is_patched else copy.copy(original)
@@ -232,7 +223,7 @@ class GuidedScheduler:
 
     def release(self) -> None:
         """Let go of the call, after its end: the wrapped methods and this object hold each other."""
-        self._inside = {}
+        self._inside, self._run = {}, None
 
     def _wrapped(self) -> dict[str, Callable[..., Any]]:
         """The two methods as instance attributes, which hide those of the class."""
@@ -246,7 +237,7 @@ class GuidedScheduler:
             trailing = trailing_timesteps(scheduler, len(scheduler.timesteps)) if self._respace else None
             self._timesteps = (scheduler.timesteps if trailing is None else trailing).cpu()[self._skipped :]
             self._done = 0
-            self._on_trajectory(self._timesteps)
+            self._run.begin(self._timesteps)
             scheduler.timesteps = self._timesteps.to(device=device)  # what the host's loop is about to take
 
         @functools.wraps(stock_step)
@@ -254,13 +245,13 @@ class GuidedScheduler:
             given = timestep
             scheduler.timesteps, timestep = self._timesteps, self._timesteps[self._done]
             self._done += 1
-            output, z_t, shift = self._on_step(model_output, timestep, sample)
+            output, z_t, shift = self._run.guide(model_output, timestep, sample)
             result = stock_step(output, timestep, z_t, *args, **kwargs)
             is_tuple = isinstance(result, tuple)
             previous = result[0] if is_tuple else result.prev_sample
             if shift is not None:
                 previous = (previous.float() + shift).to(previous.dtype)
-            previous = self._on_done(torch.as_tensor(given, device=previous.device), previous)
+            previous = self._run.after_step(torch.as_tensor(given, device=previous.device), previous)
             if is_tuple:
                 return (previous, *result[1:])
             result.prev_sample = previous

@@ -77,11 +77,7 @@ def _family(scheduler: Any) -> Callable[[Any, Tensor], NoiseLevel]:
 
 
 def check_scheduler(scheduler: Any) -> None:
-    """Refuse a scheduler that guidance (or the stock pipeline) cannot run, before anything is computed.
-
-    That is one of no family; noise prediction with zero terminal SNR, whose first step is 0 / 0, NaN in
-    diffusers too; dynamic thresholding, which is made for pixels and bends latents.
-    """
+    """Refuse a scheduler that guidance cannot run: of no family, 0 / 0 at zero SNR, or with thresholding."""
     _family(scheduler)
     name, config = type(scheduler).__name__, scheduler.config
     if getattr(config, "rescale_betas_zero_snr", False) and config.prediction_type == "epsilon":

@@ -39,8 +39,7 @@ def _finish(
 ) -> tuple[Tensor, Tensor] | None:
     """The result of a decoded map of an image or a member, ``(1, 1, H, W)`` metres, and its support.
 
-    Ramps first: a fit that finds edges steep does not carry the depth of a surface over to the next one. Then
-    the fit, and the votes of matches, colours and the fitted map. ``left (1, 3, H, W)`` is on the map's grid.
+    Ramps first: a fit that finds edges steep does not carry the depth of a surface over to the next one.
     ``None`` where there are neither matches nor points.
     """
     evidence, (kept, error) = run.evidence[image], run.kept_and_error(image, member)
@@ -127,8 +126,7 @@ def assemble_output(
 ) -> MetricDepthOutput:
     """Everything of ``MetricDepthOutput`` but ``latent``, of the stock call's output, tensors in metres.
 
-    ``call`` are the user's arguments by name; ``warned`` has the warnings so far, and whether each forbids
-    trust.
+    ``warned`` has the warnings so far, and whether each forbids trust.
     """
     natives = [evidence.native_left for evidence in run.evidence]
     # A single large picture is not copied.
@@ -230,11 +228,7 @@ def _over_prior(run: GuidedRun, depth_m: Tensor) -> Tensor | None:
 
 
 def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> MetricDepthOutput:
-    """The output of estimated poses without a unit, in the metres of a prior that has some.
-
-    Everything that is a length is multiplied by the factor that brings the depth to the prior's at half of
-    the pixels; how much that factor differs from pixel to pixel tells how uncertain it is.
-    """
+    """An output without a unit, with all its lengths in the metres of a prior that has some."""
     factor = 1.0 / float(over_prior.median())
     spread = 1.4826 * float((over_prior * factor).clamp_min(1e-9).log().abs().median())
 

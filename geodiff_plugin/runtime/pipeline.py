@@ -23,8 +23,7 @@ from geodiff_plugin.runtime.estimate import ProcessingGrid, tiny_autoencoder
 from geodiff_plugin.runtime.hooks import Exclusive, networks_of
 from geodiff_plugin.runtime.noise_levels import check_scheduler
 from geodiff_plugin.runtime.output import assemble_output, ensemble_metric
-from geodiff_plugin.runtime.run import GuidedRun, StepCallback
-from geodiff_plugin.runtime.start import depth_prompt, plan_warm_start
+from geodiff_plugin.runtime.run import GuidedRun, StepCallback, depth_prompt, plan_warm_start
 
 #: More than any call asks for, of steps, pixels or members.
 MOST = 1 << 20
@@ -200,10 +199,7 @@ def _check_guided_call(guidance: Any, callback: Any) -> None:
 
 
 def _check_arguments(call: Mapping[str, Any], images: int) -> None:
-    """Refuse arguments of the call by name that no pipeline takes, for so many left images, in our own words.
-
-    What the stock pipeline refuses in a sentence that names the argument is left to it.
-    """
+    """Refuse arguments of the call, by name, that no pipeline takes, for so many left images."""
     check_choice(call["output_type"], "output_type", ("np", "pt"))
     check_choice(call["resample_method_input"], "resample_method_input", RESAMPLING)
     check_choice(call["resample_method_output"] or "bilinear", "resample_method_output", RESAMPLING)

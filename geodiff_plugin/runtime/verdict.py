@@ -26,7 +26,7 @@ SAME, SAME_SHARE = 1.5 / 255, 0.05
 #: Points that are compared with matches: at least so many, each with matches this near, pixels of the grid.
 FEWEST_COMPARED, REACH_PX = 12, 3
 FEWEST_MATCHES = 40
-#: Median difference of the depth from what both views match, a log, from which it is not to be trusted.
+#: Median difference of the depth from what both views match from which it is not to be trusted.
 OFF_MATCHES = math.log(1.2)
 #: Log of the ratio of the 95 % and the 5 % quantile of depth below which a scene may be one plane.
 FLAT = 0.2
@@ -40,7 +40,7 @@ LEAST_ORDER, MATCHED_ENOUGH = 0.2, 0.5
 #: Two weak signs together weigh as much as one that is bad; so does an epipolar distance, in pixels.
 WEAK_CONFIDENCE, WEAK_MATCHED = 0.6, 0.4
 WEAK_ORDER, WEAK_EPIPOLAR_PX = 0.45, 1.0
-#: A rank correlation says nothing of a scene whose matched depths all lie within this (log of 95 % over 5 %).
+#: A rank correlation says nothing of a scene whose matched depths lie within this (log of 95 % over 5 %).
 LEAST_SPREAD = 0.15
 #: Points and matches that differ by the first factor are reported; by the second, the result is not trusted.
 POINTS_REPORTED, POINTS_WRONG = math.log(1.08), math.log(1.2)
@@ -103,16 +103,11 @@ class Indicators:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether one image's depth can be trusted.
+    """Whether one image's depth can be trusted."""
 
-    ``status`` is ``"trusted"``, no indicator speaks against it, ``"not trusted"``, or ``"not judged"``,
-    nothing was there to hold it against; ``reasons`` are sentences on those that do, the likeliest cause
-    first, ``remarks`` on what is unusual but may be right; ``indicators`` are the numbers behind it.
-    """
-
-    status: str
-    reasons: tuple[str, ...]
-    remarks: tuple[str, ...]
+    status: str  # "trusted", "not trusted", or "not judged": nothing was there to hold it against
+    reasons: tuple[str, ...]  # sentences on what speaks against it, the likeliest cause first
+    remarks: tuple[str, ...]  # on what is unusual but may be right
     indicators: Indicators
 
     @property
@@ -132,13 +127,9 @@ def _alike(image_01: Tensor, left_01: Tensor) -> bool:
     """Whether no value differs by more than rounding; most images differ in their first rows."""
     if image_01.shape != left_01.shape:
         return False
-    largest = 0.0
-    for rows in row_strips(*left_01.shape[-2:]):
-        largest = max(largest, float((image_01[:, rows] - left_01[:, rows]).abs().max()))
-        if largest >= SAME:
-            return False
     darkest, brightest = left_01.aminmax()
-    return largest < SAME_SHARE * float(brightest - darkest)
+    most, strips = min(SAME, SAME_SHARE * float(brightest - darkest)), row_strips(*left_01.shape[-2:])
+    return all(float((image_01[:, rows] - left_01[:, rows]).abs().max()) < most for rows in strips)
 
 
 def _points_indicators(matches: Matches, points: Matches) -> dict[str, float]:
@@ -214,10 +205,7 @@ def read_indicators(
 
 
 def points_agreement(run: Indicators) -> float:
-    """How well points and views agree, [0.25, 1]: what the confidence is multiplied by.
-
-    Two that differ by a factor of 1.2 cannot both be within 10 %, and nothing tells which of them is.
-    """
+    """How well points and views agree, [0.25, 1]: what the confidence is multiplied by."""
     if math.isnan(run.points_ratio):
         return 1.0
     off = abs(math.log(run.points_ratio))

@@ -13,7 +13,7 @@ from geodiff_plugin.evaluation import frames
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.options import SequenceOptions
 from geodiff_plugin.priors import prior_of
-from geodiff_plugin.runtime.start import plan_warm_start
+from geodiff_plugin.runtime.run import plan_warm_start
 from geodiff_plugin.types import MetricDepthOutput
 from tests.scenes import render_sequence
 
