@@ -271,7 +271,7 @@ class GuidedRun:
                 self.owners[chunk],
                 prior.space,
                 step_latents=plan.step_latents,
-                prior_range=None if own_m is None else own_m[chunk].unbind(1),
+                prior_range=None if own_m is None else (own_m[chunk, 0], own_m[chunk, 1]),
                 start_range=start,
                 valid=None if prior.valid is None else prior.valid[chunk],
             )

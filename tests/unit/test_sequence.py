@@ -118,7 +118,7 @@ def test_what_cannot_be_gone_on_from_is_refused(pipe, textured_plane, first):
     for previous, told, said in (
         (first.prediction, {}, "previous must be a MetricDepthOutput"),
         (MetricDepthOutput(first.prediction), {}, "output_latent=True"),
-        (first, {"ensemble_size": 2}, "of 1 image of 2 members; got one of 1 image of 1 member"),
+        (first, {"ensemble_size": 2}, r"of 1 images of 2 members; got \(1, 1\)"),
         (changed(space="disparity"), {}, "a prior whose map is affine in depth; got one in disparity"),
         (changed(latent=first.latent[..., :-1]), {}, "a sequence of its own"),
         (first, {"latents": first.latent[:, :1]}, "latents must be of shape"),  # would be spread silently
