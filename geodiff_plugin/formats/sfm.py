@@ -199,42 +199,34 @@ def nerf_frames(text: str) -> dict[str, Frame]:
     return {str(frame["file_path"]): shared | frame for frame in data["frames"]}
 
 
-def _nerf_lens(frame: Frame) -> tuple[str, list[float]]:
-    model = str(frame.get("camera_model", "OPENCV_FISHEYE" if frame.get("is_fisheye") else "OPENCV"))
-    if model.lower() not in LENS_MODELS:  # is refused with its name
-        return model, []
-    params = frame.get("distortion_params", [frame.get(key, 0.0) for key in NERF_PARAMS])
-    numbers = dict(zip(NERF_PARAMS, array_of(params, (6,), ", ".join(NERF_PARAMS)).tolist(), strict=True))
-    coefficients, others = NERF_LENSES[LENS_MODELS[model.lower()]]
-    if any(numbers[key] for key in others):
-        cure = "OpenCV does not have this model: undistort or rectify both images first."
-        bad_value(" and ".join(others), f"zero for {model}", [numbers[key] for key in others], cure)
-    return model, [numbers[key] for key in coefficients]
-
-
-def _focal_px(frame: Frame, axis: str, side: float) -> list[float]:
-    """The focal length of one axis; none where the file leaves it to the other one."""
-    key, angle = f"fl_{axis}", frame.get(f"camera_angle_{axis}")
-    if key in frame or angle is None:
-        return [frame[key]] if key in frame else []
-    if not 0 < angle < math.pi:
-        bad_value(f"camera_angle_{axis}", "in radians, between 0 and pi", angle, "Is it in degrees?")
-    return [0.5 * side / math.tan(0.5 * angle)]
-
-
 def nerf_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> Camera:
     """The camera of a frame; ``image_size`` is that of its image, for files without ``w`` and ``h``."""
     size = (frame["w"], frame["h"]) if "w" in frame else image_size
     if size is None:
         cure = "Give image_size, the (width, height) of the images."
         bad_value("the file", "one with entries 'w' and 'h'", "none", cure)
-    focals = _focal_px(frame, "x", float(size[0])) + _focal_px(frame, "y", float(size[1]))
+    focals = []
+    for axis, side in zip("xy", size, strict=True):
+        angle = frame.get(f"camera_angle_{axis}")
+        if f"fl_{axis}" in frame:
+            focals.append(frame[f"fl_{axis}"])
+        elif angle is not None and not 0 < angle < math.pi:
+            bad_value(f"camera_angle_{axis}", "in radians, between 0 and pi", angle, "Is it in degrees?")
+        elif angle is not None:
+            focals.append(0.5 * float(side) / math.tan(0.5 * angle))
     if not focals:
         bad_value("the file", "one with an entry 'fl_x' or 'camera_angle_x'", "none")
     K = intrinsics(focals[0], focals[-1], frame.get("cx", size[0] / 2), frame.get("cy", size[1] / 2))
     K[:2, 2] -= 0.5  # as COLMAP, nerfstudio (cameras.py) and instant-ngp have the first centre at (0.5, 0.5)
-    model, coefficients = _nerf_lens(frame)
-    return Camera(K, size, coefficients, model)
+    model = str(frame.get("camera_model", "OPENCV_FISHEYE" if frame.get("is_fisheye") else "OPENCV"))
+    # Another model is refused with its name.
+    coefficients, others = NERF_LENSES.get(LENS_MODELS.get(model.lower(), ""), ((), ()))
+    lens = frame | dict(zip(NERF_PARAMS, frame.get("distortion_params", ()), strict=False))
+    wrong = [lens[key] for key in others if lens.get(key)]
+    if wrong:
+        cure = "OpenCV does not have this model: undistort or rectify both images first."
+        bad_value(" and ".join(others), f"zero for {model}", wrong, cure)
+    return Camera(K, size, [lens.get(key, 0.0) for key in coefficients], model)
 
 
 def nerf_pose(frame: Frame) -> np.ndarray:

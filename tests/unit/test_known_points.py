@@ -32,7 +32,6 @@ def test_maps_of_every_kind_are_the_same(tmp_path):
 
 TEXTS = {
     "commas": "0.1,-0.2,2.0\n0.4,0.3,5.5\n",
-    "heading": "x,y,z\n0.1, -0.2, 2.0\n0.4, 0.3, 5.5\n",
     "remarks": "# a remark\n0.1;-0.2;2.0\n\n0.4;0.3;5.5 # the last\n",
     "other order": "id,z,y,x\n0,2.0,-0.2,0.1\n1,5.5,0.3,0.4\n",
     "words in another column": "label;x[m];y[m];z[m]\ncar;0.1;-0.2;2\ntree;0.4;0.3;5.5\n",
