@@ -117,11 +117,9 @@ def _rendered(other: DepthFrame, frame: DepthFrame) -> tuple[np.ndarray, np.ndar
     row, column, z, inside = seen_in(other, frame)
     order = np.argsort(-z[inside])  # the nearest is written last
     at = (row[inside] * frame.depth.shape[1] + column[inside])[order]
-    maps = []
-    for values in (z, other.confidence):
-        maps.append(np.zeros(frame.depth.shape))
-        maps[-1].flat[at] = values[inside][order]
-    return maps[0], maps[1]
+    depth, sure = np.zeros((2, *frame.depth.shape))
+    depth.flat[at], sure.flat[at] = z[inside][order], other.confidence[inside][order]
+    return depth, sure
 
 
 def _vote(rendered: Sequence[tuple[np.ndarray, np.ndarray]], mask: np.ndarray) -> Maps:

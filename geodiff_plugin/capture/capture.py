@@ -53,7 +53,6 @@ class Capture:
         self.names = [frame.name for frame in files.frames]
         self.unit = files.unit
         self.solved: SolvedCapture | None = None
-        self._number = {name: number for number, name in enumerate(self.names)}
         self._video: VideoReader | None = None
 
     @classmethod
@@ -81,11 +80,11 @@ class Capture:
 
     def frame(self, name: str) -> CaptureFrame:
         """The frame of a name; ``InputError`` where there is none."""
-        if name not in self._number:
+        if name not in self.names:
             some = ", ".join(self.names[:3])
             cure = "Names are file stems."
             bad_value("a frame", f"a name of the capture, such as {some}", repr(name), cure)
-        return self.files.frames[self._number[name]]
+        return self.files.frames[self.names.index(name)]
 
     def choose(self, wanted: str | None) -> list[str]:
         """Names of ``NAME,NAME`` or ``FIRST:LAST:STEP``; all for ``None``."""
@@ -157,7 +156,7 @@ class Capture:
     def neighbours(self, name: str, count: int = NEIGHBOURS) -> list[str]:
         """Frames that are right views of a frame, at most ``count``, the best first."""
         check_number(count, "neighbours", 1, 32, integer=True)
-        solved, number = self.solve(), self._number[self.frame(name).name]
+        solved, number = self.solve(), self.names.index(self.frame(name).name)
         return [self.names[i] for i in choose_neighbours(solved, number, count)]
 
     def guidance(
@@ -174,7 +173,7 @@ class Capture:
         names = self.neighbours(name, neighbours) if isinstance(neighbours, int) else list(neighbours)
         if not names:
             bad_value(f"frame {name}", "connected to others by shared points", "none shares any")
-        i, rights = self._number[name], [self._number[other] for other in names]
+        i, rights = self.names.index(name), [self.names.index(other) for other in names]
         views: list[tuple[Any, ...]] = [(None, solved.K[i], np.eye(4))]
         views += [(self.image(self.names[j]), solved.K[j], solved.pose(i, j)) for j in rights]
         settings = {"pose": "given"} if solved.status in ADJUSTED else {}
@@ -192,7 +191,7 @@ class Capture:
         if points == "none":
             return None
         if points == "tracks":
-            return self._tracked(self._number[frame.name])
+            return self._tracked(self.names.index(frame.name))
         if self.unit is None:
             cure = "Give --metres-per-unit, --known-length or --distance."
             bad_value("points", "of a capture whose scale is known", "one without a unit", cure)

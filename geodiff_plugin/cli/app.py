@@ -150,11 +150,8 @@ COMMANDS = {
     "convert": Command(_Convert, _later("cli.convert.run_convert"), "Make a folder for --prior of weights."),
     "eval": Command(None, lambda _: _imported("cli.eval.eval_app"), "Measure it and others on data sets."),
 }
-app = new_group(
-    "Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior.",
-    COMMANDS,
-    outermost=True,
-)
+ABOUT = "Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior."
+app = new_group(ABOUT, COMMANDS, outermost=True)
 
 
 def _print_version(wanted: bool) -> None:

@@ -340,29 +340,14 @@ def _base_files(base: Path, name: str) -> tuple[list[Path], set[str]]:
     return files, tensors
 
 
-def read_prompt(folder: Path) -> Tensor:
-    """The first prompt of the two ``.pt`` files, without its padding: ``(1, n, C)``."""
-    files = (folder / f"{PROMPT}_prompt_{part}.pt" for part in ("embeds", "mask"))
-    embedding, mask = (_read_checkpoint(file, Tensor) for file in files)
-    return embedding[:1, mask[0] > 0]
-
-
-def _space(file: Path, requested: str | None) -> str:
-    """As requested, or as the checkpoint's folder is called."""
-    name = file.resolve().parent.name
-    space = requested or SPACE_OF_CHECKPOINT.get(name.split("-")[0].lower())
-    if space is None:
-        cure = "Keep the authors' folder name, or say with --space what its map is affine in."
-        bad_value("CHECKPOINT", "in a folder called Log-*, Uniform-* or Disparity-*", repr(name), cure)
-    return space
-
-
-def _prompt_folder(file: Path, requested: str | None) -> Path:
-    """As requested, or where the authors' download has it: beside ``depth/``."""
+def _read_prompt(file: Path, requested: str | None) -> Tensor:
+    """The first prompt ``(1, n, C)`` of a folder as requested, or as in the authors' download, unpadded."""
     beside = [parent / PROMPT_FOLDER for parent in file.resolve().parents]
     for folder in beside if requested is None else [Path(requested)]:
         if folder.is_dir():
-            return folder
+            files = (folder / f"{PROMPT}_prompt_{part}.pt" for part in ("embeds", "mask"))
+            embedding, mask = (_read_checkpoint(file, Tensor) for file in files)
+            return embedding[:1, mask[0] > 0]
     expected = f"the folder {PROMPT_FOLDER} of huawei-bayerlab/marigold-v2-0"
     bad_value("--with", expected, requested or "none beside", f"Name it: --with .../{PROMPT_FOLDER}")
 
@@ -375,7 +360,11 @@ def _convert_marigold_v2(
     if not os.path.isfile(file) or file.suffix != ".safetensors":
         expected = f"a folder of huawei-bayerlab/marigold-v2-0 with {TRAINABLES}, such as depth/Log-stage2"
         bad_value("CHECKPOINT", expected, checkpoint, "Check the path.")
-    space, prompt = _space(file, space), read_prompt(_prompt_folder(file, prompts))
+    prompt, name = _read_prompt(file, prompts), file.resolve().parent.name
+    space = space or SPACE_OF_CHECKPOINT.get(name.split("-")[0].lower())
+    if space is None:
+        cure = "Keep the authors' folder name, or say with --space what its map is affine in."
+        bad_value("CHECKPOINT", "in a folder called Log-*, Uniform-* or Disparity-*", repr(name), cure)
     state = load_file(file)
     trained = {part: _trained(state, part) for part in FOLDERS}
     files = {}

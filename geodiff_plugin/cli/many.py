@@ -198,10 +198,7 @@ def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
     given = [] if options.baseline is None or len(refs) < 2 else [options_of(ref, options) for ref in refs]
     for calib in dict.fromkeys(each.calib for each in given if each.calib):
         if has_pose_per_image(calib if len(calib) > 1 else calib[0]):
-            cure = (
-                "Every pair of such a model has another distance. Give the model's scale: geodiff capture "
-                "MODEL with --known-length or --metres-per-unit."
-            )
+            cure = "Every pair has another one. Give the model's scale: geodiff capture MODEL --known-length."
             bad_value("--baseline", "left out with many pairs of one model", str(calib[0]), cure)
 
 

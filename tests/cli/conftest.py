@@ -71,15 +71,3 @@ def geodiff(capsys):
         return SimpleNamespace(code=code, out=captured.out, err=captured.err)
 
     return run
-
-
-@pytest.fixture(scope="session")
-def result(prior, textured_plane, tmp_path_factory):
-    """The folder of a pair and of its result ``geodiff-out``, made once: to be looked at, or copied."""
-    folder = tmp_path_factory.mktemp("result")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        words = write_pair(Path(), textured_plane).command
-        words += ["--prior", prior, "--device", "cpu", "--export", "glb", "--export", "colmap", "-q"]
-        assert call(words) == 0
-    return folder
