@@ -16,6 +16,14 @@ from examples import network_poses, posed_photographs, proof
 from tests.cli.conftest import write_pair
 from tests.contracts.tiny_priors import TINY
 
+NOTEBOOK = Path(__file__).resolve().parents[2] / "examples" / "quickstart.ipynb"
+EXECUTE = """
+import sys, nbclient, nbformat
+notebook = nbformat.read(sys.argv[1], 4)
+nbclient.NotebookClient(notebook, timeout=900, kernel_name="python3").execute()
+nbformat.write(notebook, sys.argv[2])
+"""
+
 
 @pytest.fixture
 def pair(textured_plane, tmp_path, monkeypatch) -> list[str]:
@@ -152,21 +160,12 @@ def test_the_proof_tells_what_was_run_and_what_was_not(run, textured_plane, tmp_
     assert "diffusers" in text and "Pairs: plane." in text
 
 
-NOTEBOOK = Path(__file__).resolve().parents[2] / "examples" / "quickstart.ipynb"
-EXECUTE = """
-import sys, nbclient, nbformat
-notebook = nbformat.read(sys.argv[1], 4)
-nbclient.NotebookClient(notebook, timeout=900, kernel_name="python3").execute()
-nbformat.write(notebook, sys.argv[2])
-"""
-
-
-def test_it_is_kept_without_outputs():
+def test_the_notebook_is_kept_without_outputs():
     cells = json.loads(NOTEBOOK.read_text())["cells"]
     assert all(not cell.get("outputs") and not cell.get("execution_count") for cell in cells)
 
 
-def test_it_runs_from_top_to_bottom(tmp_path):
+def test_the_notebook_runs_from_top_to_bottom(tmp_path):
     for name in ("nbclient", "nbformat", "ipykernel"):
         pytest.importorskip(name, reason=f"{name} is not installed")
     environment = os.environ | {"HF_HUB_OFFLINE": "1", "JUPYTER_PLATFORM_DIRS": "1", "TMPDIR": str(tmp_path)}

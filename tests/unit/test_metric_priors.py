@@ -94,5 +94,3 @@ def test_given_poses_without_a_unit_get_the_metres_of_a_metric_prior(textured_pl
     assert np.median(metric.prediction[0, ..., 0] / pair.depth_m) == pytest.approx(1.0, rel=0.03)
     assert sum("metres are the prior's own" in sentence for sentence in metric.warnings) == 1
     assert relative.unit is None and not any(" mm" in sentence for sentence in relative.warnings)
-    with pytest.raises(ValueError, match="unit must be 'm' or None; got 'mm'"):
-        GeometryGuidance(pair.right, pair.K, scaled, unit="mm")
