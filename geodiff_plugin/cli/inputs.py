@@ -84,8 +84,9 @@ def read_inputs(
     if options.points_confidence is not None:
         known["points_confidence"] = read_confidence(options.points_confidence, "--points-confidence")
     if rig is None:
-        lengths = {"baseline_m": options.baseline, "known_length": _known_length(options, Ks[0], lenses[0])}
-        guidance = GeometryGuidance.from_photographs(images, K=Ks, **lengths, **known, config=config)
+        known["known_length"] = _known_length(options, Ks[0], lenses[0])
+        known["baseline_m"] = options.baseline
+        guidance = GeometryGuidance.from_photographs(images, K=Ks, **known, config=config)
         rig = replace(guidance.rigs[0], size_left=sizes[0], size_right=sizes[1], source="estimated")
     elif len(images) == 1:
         if not options.cropped:
@@ -233,5 +234,5 @@ def lenses_of(options: DepthOptions, rig: Rig | None = None) -> tuple[Distortion
         cure = "Rectify the images, or give what belongs to one without it (undistorted.png of a first run)."
         names = ("points_confidence", "disparity", "prior_map")
         options.refuse(names, "of an image without lens distortion", "a lens with distortion", cure)
-    lenses = (*pair, *(further or [pair[0]] * len(options.view)))
+    lenses = [*pair, *further] if further else [*pair, *(pair[0] for _ in options.view)]
     return tuple(lens if is_distorted(lens) else None for lens in lenses)

@@ -171,5 +171,6 @@ def _of_list(path: Path, right: Path | None) -> list[PairRef]:
     for name, row in zip(told_apart([row[0] for row in rows]), rows, strict=True):
         stem = Path(name).with_suffix("").as_posix().replace("/", "_")
         counts[stem] += 1  # one left view with several right ones
-        refs.append(PairRef(stem if counts[stem] == 1 else f"{stem}-{counts[stem]}", *row))
+        name = stem if counts[stem] == 1 else f"{stem}-{counts[stem]}"
+        refs.append(PairRef(name, row[0], row[1], row[2] if len(row) > 2 else None))
     return refs
