@@ -70,6 +70,7 @@ class GeoWizardPipeline(DepthDiffusionPipeline):
         if wanted is None or any(parts[name] is None for name in wanted):
             got = [name for name, part in parts.items() if part is not None]
             bad_value("components", f"a U-Net of GeoWizard v1 or v2 with {wanted}", got)
+        couple_pairs(unet)
         defaults = prediction_type, default_denoising_steps, default_processing_resolution
         domain = check_choice(default_domain, "default_domain", DOMAINS)
         modules = {"unet": unet, "vae": vae, "scheduler": scheduler, **parts}
