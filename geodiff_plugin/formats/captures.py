@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -12,7 +11,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from geodiff_plugin._checks import InputError, MissingFileError, bad_value
-from geodiff_plugin.formats.files import natural_order, read_matrix, read_rows, read_text, upright_size
+from geodiff_plugin.formats.files import (
+    PathLike,
+    natural_order,
+    read_matrix,
+    read_rows,
+    read_text,
+    upright_size,
+)
 from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.formats.recordings import is_video, video_facts
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, lens_of, reading_whole, resized, rigid
@@ -74,11 +80,11 @@ Found = tuple[str, str | None, Sequence[tuple[CaptureFrame, Camera | None]]]
 
 
 def read_capture(
-    path: str | os.PathLike[str],
+    path: PathLike,
     *,
     K: np.ndarray | None = None,
     fov: float | None = None,
-    trajectory: str | os.PathLike[str] | None = None,
+    trajectory: PathLike | None = None,
 ) -> CaptureFiles:
     """Read the frames of a capture, whatever its layout (docs/how-to/captures.md).
 

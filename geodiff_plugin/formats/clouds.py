@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 from geodiff_plugin._camera_checks import check_intrinsics
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.depth import row_strips
+from geodiff_plugin.formats.files import PathLike
 from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 
@@ -104,7 +104,7 @@ def _cloud_strips(
 
 
 def write_ply(
-    path: str | os.PathLike[str],
+    path: PathLike,
     depth_m: np.ndarray,
     image_01: np.ndarray,
     K: np.ndarray,
@@ -122,7 +122,7 @@ def write_ply(
 
 
 def write_vertices(
-    path: str | os.PathLike[str],
+    path: PathLike,
     frame: str,
     unit: str | None,
     count: int,
@@ -153,9 +153,7 @@ def _pyramid(K: np.ndarray, E: np.ndarray, size: tuple[int, int], length_m: floa
 
 
 def write_glb(
-    path: str | os.PathLike[str],
-    cloud: Cloud,
-    cameras: Sequence[tuple[np.ndarray, np.ndarray, tuple[int, int]]] = (),
+    path: PathLike, cloud: Cloud, cameras: Sequence[tuple[np.ndarray, np.ndarray, tuple[int, int]]] = ()
 ) -> None:
     """Write a cloud, which may be empty, and its cameras as GLB, whole or not at all.
 

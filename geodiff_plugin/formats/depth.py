@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -14,13 +13,12 @@ from PIL import Image
 
 from geodiff_plugin._camera_checks import check_intrinsics, check_metres
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.formats.files import check_file, open_image, read_npy, read_rows, read_text
+from geodiff_plugin.formats.files import PathLike, check_file, open_image, read_npy, read_rows, read_text
 from geodiff_plugin.formats.out import atomic_path
 
 if TYPE_CHECKING:  # which imports torch
     from geodiff_plugin.types import Rig
 
-PathLike = str | os.PathLike[str]
 LARGEST_MM, MILLIMETRES, KITTI_UNITS = 65535, 1000.0, 256.0
 #: Pixels of a strip: a map of float64 of so many is 8 MB.
 STRIP_PIXELS = 1 << 20
@@ -144,11 +142,7 @@ def read_map(path: PathLike, name: str = "map") -> np.ndarray:
 
 
 def read_points(
-    path: PathLike,
-    name: str = "points",
-    *,
-    scale: float | None = None,
-    calibration: Sequence[PathLike] = (),
+    path: PathLike, name: str = "points", *, scale: float | None = None, calibration: Sequence[PathLike] = ()
 ) -> np.ndarray:
     """Read known depths of the left image: ``(H, W)`` float32 metres, 0 where unknown, or ``(N, 3)``.
 

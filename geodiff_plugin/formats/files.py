@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # what is wrong with a file is said before numpy is imported
     import numpy as np
     from PIL import Image
 
+PathLike = str | os.PathLike[str]
 #: EXIF's tag of how an image is turned or mirrored; from 5 on its sides change places.
 ORIENTATION = 0x0112
 #: A number whose decimals follow a comma, alone between blanks, semicolons or the ends of a line.
@@ -30,7 +31,7 @@ FLAT = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
 MATRIX = "a 3x3 K or a 4x4 (or 3x4) E, as text of numbers or .npy"
 
 
-def check_file(path: str | os.PathLike[str], name: str, what: str = "a file") -> Path:
+def check_file(path: PathLike, name: str, what: str = "a file") -> Path:
     """The path of an existing, readable, non-empty file; messages name the argument and what it is."""
     if not isinstance(path, (str, os.PathLike)):
         bad_type(name, f"the path of {what}", path)
@@ -53,7 +54,7 @@ DECODE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, KeyError, EOFError
 
 
 @contextmanager
-def open_image(path: str | os.PathLike[str], name: str, what: str = "an image file") -> Iterator[Image.Image]:
+def open_image(path: PathLike, name: str, what: str = "an image file") -> Iterator[Image.Image]:
     """Open an image file with Pillow, HEIC by pillow-heif; what is none, or damaged, is refused."""
     from PIL import Image, UnidentifiedImageError
 
@@ -92,7 +93,7 @@ def natural_order(path: Path) -> tuple[list[str | int], str]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
 
-def upright_size(path: str | os.PathLike[str], name: str) -> tuple[int, int]:
+def upright_size(path: PathLike, name: str) -> tuple[int, int]:
     """``(width, height)`` of an image file as it is read, turned by its EXIF orientation."""
     with open_image(path, name) as image:
         width, height = image.size
@@ -100,7 +101,7 @@ def upright_size(path: str | os.PathLike[str], name: str) -> tuple[int, int]:
     return (height, width) if turned else (width, height)
 
 
-def read_text(path: str | os.PathLike[str], name: str, what: str = "a text file") -> str:
+def read_text(path: PathLike, name: str, what: str = "a text file") -> str:
     """The text of a file, with Unix line ends and no byte-order mark."""
     file = check_file(path, name, what)
     cure = "Is this an image or an archive?"
@@ -115,7 +116,7 @@ def read_text(path: str | os.PathLike[str], name: str, what: str = "a text file"
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def read_rows(path: str | os.PathLike[str], name: str, what: str) -> list[list[str]]:
+def read_rows(path: PathLike, name: str, what: str) -> list[list[str]]:
     """The words of every line that has any, without remarks behind ``#`` and ``//``, quotes and separators.
 
     Decimal commas are refused: ``1,5 2,5 3,0`` would be six numbers; ``1,2`` alone may be two columns.
@@ -161,7 +162,7 @@ def read_npy(path: Path, name: str, expected: str) -> np.ndarray:
     return value
 
 
-def read_matrix(path: str | os.PathLike[str], name: str = "matrix") -> np.ndarray:
+def read_matrix(path: PathLike, name: str = "matrix") -> np.ndarray:
     """A K ``(3, 3)`` or a pose ``(4, 4)``, float64, from ``.npy`` or text: rows, or all numbers in one."""
     import numpy as np
 

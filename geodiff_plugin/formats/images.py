@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from typing import Any
 
 import cv2
@@ -13,7 +12,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from geodiff_plugin._checks import InputError, bad_type, bad_value, check_number, warn
-from geodiff_plugin.formats.files import ORIENTATION, open_image
+from geodiff_plugin.formats.files import ORIENTATION, PathLike, open_image
 from geodiff_plugin.formats.rigs import COEFFICIENT_COUNTS, intrinsics
 from geodiff_plugin.types import Distortion
 
@@ -97,7 +96,7 @@ def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
     return np.repeat(value, 3, axis=-1) if value.shape[-1] == 1 else value, notes
 
 
-def read_image(path: str | os.PathLike[str], name: str = "left") -> tuple[np.ndarray, list[str]]:
+def read_image(path: PathLike, name: str = "left") -> tuple[np.ndarray, list[str]]:
     """An image file, upright, ``(H, W, 3)`` float32 in [0, 1], and sentences about what was done to it."""
     with open_image(path, name) as image:
         notes = _file_notes(image, name)
@@ -171,9 +170,7 @@ def intrinsics_from_fov(fov_deg: float, size: tuple[int, int]) -> np.ndarray:
     return intrinsics(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
 
 
-def intrinsics_from_exif(
-    source: str | os.PathLike[str] | Image.Image, name: str
-) -> tuple[np.ndarray, list[str]]:
+def intrinsics_from_exif(source: PathLike | Image.Image, name: str) -> tuple[np.ndarray, list[str]]:
     """K of a photograph to a few per cent, of a file upright, of an image as it lies; what was assumed."""
     if not isinstance(source, Image.Image):
         with open_image(source, name) as image:
@@ -214,7 +211,7 @@ def intrinsics_from_exif(
     return intrinsics(fx, fy, (width - 1) / 2, (height - 1) / 2), notes
 
 
-def warn_of_other_lens(source: str | os.PathLike[str] | Image.Image, K: np.ndarray, name: str) -> None:
+def warn_of_other_lens(source: PathLike | Image.Image, K: np.ndarray, name: str) -> None:
     """Warn of a focal length that contradicts the EXIF data of an uncropped image."""
     try:
         theirs, notes = intrinsics_from_exif(source, name)

@@ -12,6 +12,7 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_type, bad_value, check_number, warn
 from geodiff_plugin.formats import sfm, stereo
+from geodiff_plugin.formats.files import PathLike
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
 from geodiff_plugin.types import Rig
 
@@ -60,8 +61,6 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "colmap": CalibrationFormat(
         "COLMAP model (cameras.txt and images.txt)", sfm.MARK, sfm.read_colmap, (2,), by_image=True),
 }  # fmt: skip
-
-PathLike = str | os.PathLike[str]
 
 
 def _texts(path: PathLike | Sequence[PathLike]) -> dict[Path, str]:

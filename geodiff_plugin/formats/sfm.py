@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 import struct
 from collections.abc import Iterator, Sequence
@@ -16,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.clouds import Cloud
-from geodiff_plugin.formats.files import check_file, read_text
+from geodiff_plugin.formats.files import PathLike, check_file, read_text
 from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.formats.rigs import (
     LENS_MODELS,
@@ -61,7 +60,7 @@ def model_files(folder: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def calibration_text(path: str | os.PathLike[str]) -> str:
+def calibration_text(path: PathLike) -> str:
     """The text of a calibration file, of a COLMAP model without its points."""
     path = check_file(path, "calibration", "a calibration file")
     if path.name == "cameras.bin":
@@ -252,7 +251,7 @@ def check_colmap_names(names: Sequence[str]) -> None:
 
 
 def write_colmap(
-    folder: str | os.PathLike[str],
+    folder: PathLike,
     views: Sequence[tuple[str, np.ndarray, np.ndarray, tuple[int, int]]],
     cloud: Cloud,
     seen: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
