@@ -15,9 +15,10 @@ from diffusers import MarigoldDepthPipeline
 
 from examples.training.data import held_out
 from examples.training.validate import contact_sheet, predict, score_scenes
-from geodiff_plugin.bundled import PRIOR_FOLDER, open_pipeline
+from geodiff_plugin.bundled import open_pipeline
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.metrics import align, evaluate_depth
+from geodiff_plugin.priors import BUNDLED_FOLDER
 
 __all__ = ["best_constant", "best_plane", "main", "score_pairs"]
 
@@ -95,7 +96,7 @@ def main(argv: list[str] | None = None) -> None:
     """Command line; see ``--help``."""
     parser = argparse.ArgumentParser(prog="python -m examples.training.evaluate", description=__doc__)
     parser.add_argument(
-        "--prior", type=Path, default=PRIOR_FOLDER, help="pipeline folder; the bundled one by default"
+        "--prior", type=Path, default=BUNDLED_FOLDER, help="pipeline folder; the bundled one by default"
     )
     parser.add_argument("--data", type=Path, help="folder of real pairs; none are scored without it")
     parser.add_argument("--scenes", type=int, default=200, help="held-out rendered scenes, 0 for none")

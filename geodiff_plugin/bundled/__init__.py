@@ -11,9 +11,9 @@ from diffusers import MarigoldDepthPipeline
 from diffusers.utils import logging as diffusers_logging
 from transformers.utils import logging as transformers_logging
 
-__all__ = ["PRIOR_FOLDER", "load_bundled_prior", "no_bars", "open_pipeline"]
+from geodiff_plugin.priors import BUNDLED_FOLDER
 
-PRIOR_FOLDER = Path(__file__).parent / "prior"
+__all__ = ["load_bundled_prior", "no_bars", "open_pipeline"]
 
 
 def load_bundled_prior(
@@ -23,7 +23,7 @@ def load_bundled_prior(
 
     ``device`` is the CPU for ``None``; ``OSError`` where the package was installed without its weights.
     """
-    return open_pipeline(PRIOR_FOLDER, device, dtype)
+    return open_pipeline(BUNDLED_FOLDER, device, dtype)
 
 
 def open_pipeline(

@@ -12,21 +12,22 @@ from diffusers import MarigoldDepthPipeline
 from examples.training import data
 from examples.training.models import save_prior
 from examples.training.train import parse, run
-from geodiff_plugin.bundled import PRIOR_FOLDER, load_bundled_prior
+from geodiff_plugin.bundled import load_bundled_prior
+from geodiff_plugin.priors import BUNDLED_FOLDER
 from tests.conftest import guided_call, quiet
 
 
 def test_the_folder_is_small_and_holds_no_pickle():
-    files = [path for path in PRIOR_FOLDER.rglob("*") if path.is_file()]
+    files = [path for path in BUNDLED_FOLDER.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) <= 16e6
     assert {path.suffix for path in files} <= {".safetensors", ".json", ".md", ".txt"}
-    assert not any("_name_or_path" in path.read_text() for path in PRIOR_FOLDER.rglob("*.json"))
-    scheduler = json.loads((PRIOR_FOLDER / "scheduler" / "scheduler_config.json").read_text())
+    assert not any("_name_or_path" in path.read_text() for path in BUNDLED_FOLDER.rglob("*.json"))
+    scheduler = json.loads((BUNDLED_FOLDER / "scheduler" / "scheduler_config.json").read_text())
     assert scheduler["timestep_spacing"] == "trailing" and scheduler["rescale_betas_zero_snr"]
 
 
 def test_diffusers_alone_loads_it_without_a_dtype_and_saves_it_again(textured_plane, tmp_path):
-    pipe = quiet(MarigoldDepthPipeline.from_pretrained(PRIOR_FOLDER))
+    pipe = quiet(MarigoldDepthPipeline.from_pretrained(BUNDLED_FOLDER))
     assert {part.dtype for part in (pipe.unet, pipe.vae, pipe.text_encoder)} == {torch.float32}
     assert (pipe.vae_scale_factor, pipe.config.prediction_type) == (4, "disparity")
     again = save_prior(pipe, tmp_path / "again")

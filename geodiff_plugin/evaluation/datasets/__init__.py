@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.bundled import PRIOR_FOLDER
+from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from geodiff_plugin.evaluation.datasets.layouts import LAYOUTS
 from geodiff_plugin.evaluation.datasets.sample import (
     CHANGES,
@@ -54,7 +54,7 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **option
 
 def data_of(options: Any) -> Path:
     """Where the samples are: what was given, or the pair that ships with the package."""
-    return options.data or PRIOR_FOLDER.parent / "pair"
+    return options.data or DEMO_PAIR_FOLDER
 
 
 def all_refs(options: SampleOptions, datasets: Sequence[str] = ()) -> list[SampleRef]:
