@@ -44,8 +44,8 @@ LEAST_ERROR, MOST_ERROR = 0.01, 0.5
 IMAGE_EDGE, DEPTH_EDGE = 0.1, 0.1
 #: Share of the smoothness that remains across any edge.
 LEAST_LINK = 1e-3
-#: Smoothness and least inertia of the first: it corrects whole regions, far from any match too.
-#: log depth.
+#: How far the window of a match reaches over an edge, as a share of the longer side, and which step in log
+#: depth is an edge.
 EDGE_REACH, EDGE_STEP = 0.006, 0.3
 #: The step grows with the third power of an error of the prior above this: it does not know where edges are.
 EDGE_ERROR = 0.11

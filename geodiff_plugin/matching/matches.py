@@ -19,12 +19,17 @@ UNIT = 0.01
 #: gaps that the prior misses would be taken for reflections.
 REGION = 0.08
 #: How far behind the prior a reflection lies: in spreads of the matches around the prior's log depth, and at
-#: least, in log depth.
-SPREADS, LEAST_DISTANCE = 2.0, 0.2
+#: least, in log depth. A prior that misses a whole wall would have it rejected at fewer spreads.
+SPREADS, LEAST_DISTANCE = 3.0, 0.2
 #: From there to this multiple of it, a match's weight falls to nothing.
 MULTIPLE = 1.6
 #: Confidence above which a match counts in that spread, and the least spread that is assumed, in log depth.
 SPREAD_CONFIDENCE, SPREAD_FLOOR = 0.3, 0.05
+#: Share of the distances by which the spread is measured, and the normal distribution's quantile there: the
+#: median would not see that nearly half of the scene is on a wrong surface.
+SPREAD_SHARE, NORMAL_QUANTILE = 0.6, 0.8416
+#: About so many distances are sorted: torch's quantile takes no more than 16 million.
+MOST_SORTED = 1 << 22
 #: Larger differences in log depth count as this one.
 LARGEST = 1.5
 
@@ -144,7 +149,8 @@ def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
     behind = -(matches.inverse_depth * depth_m).clamp_min(1e-6).log().clamp(-LARGEST, LARGEST)
     counted = torch.where(weight > SPREAD_CONFIDENCE, behind, torch.full_like(behind, torch.nan)).flatten(1)
     middle = counted.nanmedian(1, keepdim=True).values
-    spread = 1.4826 * (counted - middle).abs().nanmedian(1).values
+    apart = (counted - middle).abs()[:, :: 1 + counted.numel() // MOST_SORTED]
+    spread = apart.nanquantile(SPREAD_SHARE, 1) / NORMAL_QUANTILE
     spread = spread.nan_to_num(LARGEST).clamp_min(SPREAD_FLOOR)
     least = (SPREADS * spread).clamp_min(LEAST_DISTANCE)[:, None, None, None]
     radius = max(1, round(REGION * max(depth_m.shape[-2:])))
