@@ -1,7 +1,6 @@
 """Reports of a training run: losses, held-out errors, a contact sheet, the prior so far.
 
 Data flow: averaged weights -> pipeline folder, ``log.jsonl``, ``contact.png`` in the run's folder.
-Paper: none.
 """
 
 from __future__ import annotations

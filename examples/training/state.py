@@ -2,7 +2,6 @@
 
 Data flow: U-Net, its moving average, AdamW moments, counters -> ``state.safetensors`` + ``state.json``
     -> the same.
-Paper: none.
 """
 
 from __future__ import annotations

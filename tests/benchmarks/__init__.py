@@ -1,5 +1,4 @@
 """Benchmarks: each module prints one table, run as ``python -m tests.benchmarks.NAME``.
 
 Data flow: this machine -> seconds.
-Paper: none.
 """

@@ -1,7 +1,6 @@
 """Seconds of a stock call: ``python -m tests.benchmarks.bundled_prior``.
 
 Data flow: bundled prior, a rendered image -> wall-clock of the stock pipeline at its defaults.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Seconds of a guided call beside the plain call and OpenCV's eight-path semi-global matching.
 
 Data flow: rendered or real pairs -> a table (``python -m tests.benchmarks.calls``).
-Paper: none.
 """
 
 from __future__ import annotations

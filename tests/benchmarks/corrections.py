@@ -1,7 +1,6 @@
 """Which corrections are worth their cost: error of the default with fewer, coarser or tiny-decoder ones.
 
 Data flow: rendered pairs, knobs -> AbsRel with the bundled prior and with emulated ones -> table.
-Paper: none.
 
     python -m tests.benchmarks.corrections --pairs 3 corrections=4 corrections=2
 """

@@ -1,7 +1,6 @@
 """Seconds to import the package and to start the command.
 
 Data flow: one fresh interpreter per line -> a table on standard output.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 Data flow: a rendered pair of W x H -> the command in a process of its own -> resident memory by stage, error,
     judgement.
-Paper: none.
 
 The scene is known in closed form: a wall that leans back, and a panel that hangs before it, in a texture
 with detail at every size, so that a picture of any number of pixels costs one look-up a pixel. The wall is

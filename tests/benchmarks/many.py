@@ -2,7 +2,6 @@
 
 Data flow: rendered pairs in two folders -> the stages of the command, overlapped and not -> a table
     (``python -m tests.benchmarks.many``).
-Paper: none.
 """
 
 from __future__ import annotations

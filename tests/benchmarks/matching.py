@@ -1,7 +1,6 @@
 """CPU seconds of every stage of the matching, beside OpenCV's eight-path semi-global matching.
 
 Data flow: rendered or real pairs -> a table (``python -m tests.benchmarks.matching``).
-Paper: none.
 """
 
 from __future__ import annotations

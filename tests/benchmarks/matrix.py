@@ -1,7 +1,6 @@
 """Speed and deviation of a guided call under the host's switches (compile, bfloat16, slicing, offload).
 
 Data flow: a prior, the demo pair -> the same call with each switch -> ratio of seconds, largest deviation.
-Paper: none.
 """
 
 from __future__ import annotations

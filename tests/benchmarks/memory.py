@@ -2,7 +2,6 @@
 
 Data flow: architecture -> one step under ``FakeTensorMode``
     -> bytes of weights, and of what lives beside them.
-Paper: none.
 
 Run ``python -m tests.benchmarks.memory [KEY ...]`` for the table of docs/reference/priors.md.
 """

@@ -1,7 +1,6 @@
 """Scenes per second of the renderer, by image size and device.
 
 Data flow: nothing -> a table on standard output.
-Paper: none.
 """
 
 from __future__ import annotations

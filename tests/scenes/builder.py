@@ -1,7 +1,6 @@
 """Collects primitives, lights and a camera while a layout draws them, then packs them into a ``Scene``.
 
 Data flow: calls like ``box(centre, size, ...)`` -> tensors of a ``Scene``.
-Paper: none.
 """
 
 from __future__ import annotations

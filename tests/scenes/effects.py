@@ -1,7 +1,6 @@
 """What a camera does to an image: white balance, contrast, vignetting, blur, noise, JPEG, grey.
 
 Data flow: a clean sRGB image -> the same image as a real camera would have written it.
-Paper: none.
 """
 
 from __future__ import annotations

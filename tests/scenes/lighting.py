@@ -1,7 +1,6 @@
 """Lights of a batch of scenes: lamps and suns with shadows, ambient light with occlusion, the sky.
 
 Data flow: surface points and normals -> light that arrives; directions -> sky.
-Paper: none.
 """
 
 from __future__ import annotations

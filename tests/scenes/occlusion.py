@@ -1,7 +1,6 @@
 """Ambient occlusion from distances to the nearest surfaces.
 
 Data flow: surface points and normals + primitives -> openness in [0, 1].
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Photographs as textures, only on request and only for training: those that scikit-image bundles.
 
 Data flow: files of the installed scikit-image -> atlas layers; a ``Scene`` -> some surfaces re-covered.
-Paper: none.
 """
 
 from __future__ import annotations

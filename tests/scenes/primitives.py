@@ -1,7 +1,6 @@
 """Ray intersections with the canonical shapes, in each primitive's local coordinates.
 
 Data flow: local rays -> distance along the ray (``inf`` for a miss); a hit -> normal, surface coordinates.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Rendering: cameras to ray bundles, nearest hits, light, one bounce, smooth edges, exposure.
 
 Data flow: ``Scene`` + ``Camera`` -> ``RenderedView``.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Stereo sequences: a rig moves through a static scene, with exact depth and poses.
 
 Data flow: a seed -> ``SyntheticSequence``.
-Paper: none.
 """
 
 from __future__ import annotations

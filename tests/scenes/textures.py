@@ -2,7 +2,6 @@
 
 Data flow: surface coordinates in metres + a primitive's layer and palette
     -> albedo, gloss and shade per pixel.
-Paper: none.
 """
 
 from __future__ import annotations

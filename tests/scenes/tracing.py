@@ -1,7 +1,6 @@
 """Ray casting: bundles of rays, primitives culled by a cone around each bundle, then exact intersections.
 
 Data flow: ray bundles + primitives -> nearest hit, or how strongly something blocks the way.
-Paper: none.
 """
 
 from __future__ import annotations

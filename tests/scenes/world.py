@@ -1,7 +1,6 @@
 """The primitives of a batch of scenes as tables, one row a primitive, on the device that renders.
 
 Data flow: ``Scene`` records -> ``World``.
-Paper: none.
 """
 
 from __future__ import annotations

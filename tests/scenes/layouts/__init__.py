@@ -1,7 +1,6 @@
 """Layouts: one file a kind of place, each drawing primitives, lights and a camera.
 
 Data flow: a seed and a kind -> ``Scene``.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Small things that lie and stand around: boxes, books, papers, cups, bottles, leaflets, cloth.
 
 Data flow: a place and a size -> primitives in a ``Builder``.
-Paper: none.
 """
 
 from __future__ import annotations

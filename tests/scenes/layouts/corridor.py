@@ -1,7 +1,6 @@
 """Corridors: a long narrow room with doors, lamps and things along the walls.
 
 Data flow: draws -> ``Scene`` of kind "corridor".
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Furniture: tables, shelves, cabinets, kitchen counters, monitors, lamps.
 
 Data flow: a place and a size -> primitives in a ``Builder``.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Flat patches on the ground, as fields and drives are: colour that changes, depth that does not.
 
 Data flow: an area -> quads in a ``Builder``.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """What indoor kinds share: floor, walls and ceiling, things on walls, lamps, ambient light.
 
 Data flow: draws -> primitives, lights and fields of a ``Scene``.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Sun, sky, haze and buildings, shared by streets and terrain.
 
 Data flow: draws -> lights and sky fields of a ``Scene``; buildings in a ``Builder``.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Plausible colours and surface looks, shared by all layouts.
 
 Data flow: random draws -> ``Look``.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Vegetation and stones: pot plants, trees, tree lines, bushes, hedges, boulders.
 
 Data flow: a place and a size -> primitives in a ``Builder``.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """The sides of a street: rows of blocks, houses in gardens, or open country.
 
 Data flow: a cross-section and a side -> primitives in a ``Builder``.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Rooms: floor, walls and ceiling, furniture along the walls and in the middle, clutter, lamps and windows.
 
 Data flow: draws -> ``Scene`` of kind "room".
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Seats: chairs, slatted garden chairs, benches, sofas.
 
 Data flow: a place and a size -> primitives in a ``Builder``.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """A place to put things: local coordinates with a heading, heights upwards from the ground.
 
 Data flow: local positions and sizes -> primitives in a ``Builder``.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Streets in towns, suburbs and the country: road and kerbs, facades, gardens, cars, poles, trees, people.
 
 Data flow: draws -> ``Scene`` of kind "street".
-Paper: none.
 """
 
 from __future__ import annotations

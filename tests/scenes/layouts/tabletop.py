@@ -1,7 +1,6 @@
 """Table tops: many touching and overlapping things seen from near, a wall behind.
 
 Data flow: draws -> ``Scene`` of kind "tabletop".
-Paper: none.
 """
 
 from __future__ import annotations

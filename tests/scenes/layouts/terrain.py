@@ -1,7 +1,6 @@
 """Open ground: hills, rocks, bushes and trees, and terraces with steps, walls, railings and benches.
 
 Data flow: draws -> ``Scene`` of kind "terrain".
-Paper: none.
 """
 
 from __future__ import annotations

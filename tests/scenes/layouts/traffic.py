@@ -1,7 +1,6 @@
 """Cars and vans, people, poles with lamps, signs and wires.
 
 Data flow: a place -> primitives in a ``Builder``.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """The layers of the texture atlas: what each is, and how many metres one tile of it covers.
 
 Data flow: a layer's name and number -> a ``(TEXELS, TEXELS, 4)`` tile that repeats without a seam.
-Paper: none.
 """
 
 from __future__ import annotations

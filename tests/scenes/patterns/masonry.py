@@ -1,7 +1,6 @@
 """Built surfaces: bricks, planks, roofs, roads, facades, shops.
 
 Data flow: a random generator -> a ``(TEXELS, TEXELS, 4)`` tile.
-Paper: none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Noise families and simple repeats: fractal, cellular, marble, wood, stripes, checkers, cloth.
 
 Data flow: a random generator -> a ``(TEXELS, TEXELS, 4)`` tile that repeats without a seam.
-Paper: none.
 """
 
 from __future__ import annotations

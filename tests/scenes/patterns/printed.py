@@ -1,7 +1,6 @@
 """Printed and made things: text, posters, books, screens, keyboards, cupboard fronts, doors, windows.
 
 Data flow: a random generator -> a ``(TEXELS, TEXELS, 4)`` tile.
-Paper: none.
 """
 
 from __future__ import annotations
