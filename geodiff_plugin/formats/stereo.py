@@ -191,12 +191,13 @@ def _rs_json(text: str) -> tuple[Camera, Camera, np.ndarray]:
     views = [values for values in objects if "ppx" in values]
     between = [values for values in objects if "translation" in values]
     if len(views) != 2 or len(between) != 1:
-        expected = "two rs2 intrinsics (fx, fy, ppx, ppy) of the infrared pair and their extrinsics alone"
+        expected = "two rs2 intrinsics (fx, fy, ppx, ppy), of the infrared pair, and their extrinsics alone"
         bad_value("the file", expected, f"{len(views)} and {len(between)}", "Is the file cut off?")
     # rs2 keeps a rotation column by column.
     R = array_of(between[0]["rotation"], (3, 3), "the rotation of the extrinsics").T
     T = transform(R, between[0]["translation"], "the extrinsics")
-    return _rs_camera(views[0]), _rs_camera(views[1]), T
+    # From the left to the right one x becomes smaller; a file that says it the other way round is inverted.
+    return _rs_camera(views[0]), _rs_camera(views[1]), T if T[0, 3] <= 0 else np.linalg.inv(T)
 
 
 def read_realsense(texts: tuple[str, ...], choice: CameraChoice) -> Rig:

@@ -25,6 +25,11 @@ from geodiff_plugin.runtime.noise_levels import check_scheduler
 from geodiff_plugin.runtime.output import assemble_output, ensemble_metric
 from geodiff_plugin.runtime.run import GuidedRun, StepCallback, depth_prompt, plan_warm_start
 
+#: What every stock pipeline's call takes, whatever the prior.
+STOCK_ARGUMENTS = (
+    *("output_type", "resample_method_input", "resample_method_output", "batch_size", "num_inference_steps"),
+    *("processing_resolution", "ensemble_size", "generator", "latents"),
+)
 #: More than any call asks for, of steps, pixels or members.
 MOST = 1 << 20
 
@@ -173,17 +178,26 @@ class GuidedCall(_Stock):
 
 
 def _bind(stock_call: Callable[..., Any], *args: Any, **kwargs: Any) -> dict[str, Any]:
-    """All arguments of the stock call by name, defaults and what a prior or a subclass adds included."""
+    """All arguments of the stock call by name, defaults and what a prior adds included."""
     signature = inspect.signature(stock_call)
     bound = signature.bind(*args, **kwargs)
     bound.apply_defaults()
-    given = dict(bound.arguments)
+    call = dict(bound.arguments)
     for name, parameter in signature.parameters.items():
         if parameter.kind is parameter.VAR_KEYWORD:
-            given |= given.pop(name)
-    # A subclass may hide the stock arguments behind ``**kwargs``.
-    stock = inspect.signature(MarigoldDepthPipeline.__call__).parameters.values()
-    return {p.name: p.default for p in stock if p.default is not p.empty} | given
+            call |= call.pop(name)
+    return call
+
+
+def _check_named_arguments(pipeline: type) -> None:
+    """Refuse a subclass whose ``__call__`` does not name the arguments of the stock pipeline."""
+    named = inspect.signature(pipeline.__call__).parameters
+    if missing := [name for name in STOCK_ARGUMENTS if name not in named]:
+        refuse(
+            f"The __call__ of {pipeline.__name__} must name the arguments of the stock pipeline that it "
+            f"overrides; it has no {', '.join(missing)}. A **kwargs that hands them on hides them: "
+            "write them out."
+        )
 
 
 def _check_guided_call(guidance: Any, callback: Any) -> None:
@@ -283,10 +297,11 @@ def enable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
     """Let a live pipeline take ``guidance=``; nothing else about it changes. Returns the same object.
 
     Raises:
-        InputError: no adapter in ``PRIORS`` understands it.
+        InputError: no adapter in ``PRIORS`` understands it, or its call hides the stock arguments.
     """
     prior_of(pipe)
     if not isinstance(pipe, GuidedCall):
+        _check_named_arguments(type(pipe))
         pipe.__class__ = _guided_class(pipe.__class__)
     return pipe
 

@@ -1,5 +1,9 @@
 """The example model of the robustmvd benchmark: its form, its poses, its metrics."""
 
+import importlib.util
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -63,3 +67,22 @@ def test_metrics_by_hand():
     assert scores["inliers103"] == pytest.approx(100 * inside.mean(), rel=1e-5)
     assert scores["ause"] == pytest.approx(0, abs=1e-6)
     assert benchmark_metrics(depth, truth, uncertainty)["ause"] > 0.1
+
+
+@pytest.mark.skipif("ROBUSTMVD" not in os.environ, reason="ROBUSTMVD names no checkout of the benchmark")
+def test_metrics_are_the_benchmarks(monkeypatch):
+    stock = np.nan_to_num  # the benchmark's call is NumPy 1's
+    monkeypatch.setattr(np, "nan_to_num", lambda x, copy=True, **fill: stock(x, **fill))
+    path = Path(os.environ["ROBUSTMVD"]) / "rmvd" / "eval" / "metrics.py"
+    spec = importlib.util.spec_from_file_location("benchmark_metrics_of_rmvd", path)
+    theirs = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(theirs)
+    depth, truth, uncertainty = map_and_truth()
+    ours, mask = benchmark_metrics(depth, truth, uncertainty), np.ones_like(truth, dtype=bool)
+    given = {"gt": truth, "pred": np.clip(depth, 0.1, 100)}
+    percent = given | {"output_scaling_factor": 100.0}
+    assert ours["absrel"] == pytest.approx(theirs.m_rel_ae(**percent), rel=1e-5)
+    assert ours["inliers103"] == pytest.approx(theirs.thresh_inliers(**percent, thresh=1.03), rel=1e-5)
+    oracle = theirs.pointwise_rel_ae(**given, mask=mask)
+    curves = [theirs.sparsification(**given, uncertainty=u, mask=mask.copy()) for u in (uncertainty, oracle)]
+    assert ours["ause"] == pytest.approx(float((curves[0] - curves[1]).sum() / 100), abs=2e-3)

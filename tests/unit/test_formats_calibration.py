@@ -197,6 +197,8 @@ def test_realsense_models(reading):
         assert of(model, [0.0] * 5).rectified, "zeros are no lens"
         with pytest.raises(InputError, match=r"lens model of the left .*got .*rectify"):
             of(model, five)
+    data["extrinsics"]["translation"] = [0.3, 0, 0]
+    assert of("none", [0.0] * 5).E[0, 3] == pytest.approx(0.3), "from right to left it is inverted"
 
 
 def test_oak_scales_to_the_image_and_takes_the_right_cameras_intrinsics(reading):
