@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 import sys
+import tempfile
 import threading
 import traceback
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from shutil import rmtree
 from types import SimpleNamespace
 from typing import Any
@@ -34,9 +37,10 @@ from geodiff_plugin.app.results import (
     write_scene,
 )
 from geodiff_plugin.cli.depth import Job
+from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.outputs import depth_summary
 
-#: A visitor's uploads, result and files are deleted after this long.
+#: A visitor's uploads, result and files are deleted after this long, and when the tab is closed.
 FORGET_AFTER_S = 600
 #: The cloud: points of this confidence, looked at from so many degrees around it and down from above, and
 #: from a share of its depth.
@@ -69,8 +73,19 @@ QUICK: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibil
 
 
 def _forget(job: Job | None) -> None:
-    if job is not None:
-        rmtree(job.folder.path, ignore_errors=True)
+    _delete([] if job is None else [job.folder.path])
+
+
+def _uploads(options: DepthOptions) -> set[Path]:
+    """The folders of a visitor's uploads: gradio makes one a file. Examples of ours lie elsewhere."""
+    files = (*options.photographs().values(), *options.calib)
+    temporary = Path(tempfile.gettempdir()).resolve()
+    return {path.parent for path in files if temporary in path.resolve().parents}
+
+
+def _delete(folders: Iterable[Path]) -> None:
+    for folder in folders:
+        rmtree(folder, ignore_errors=True)
 
 
 def for_visitors(sentence: str) -> str:
@@ -156,7 +171,9 @@ def _wire_run(
 ) -> Callable[[gr.Request], Any]:
     """Everything from the run to its result; what happens when a visitor leaves."""
     fields, turn = list(form.fields.values()), threading.Lock()  # one job runs at a time
-    stops = dict[str | None, threading.Event]()  # by session; a call over the API may have none
+    # By session; a call over the API may have none. Folders are of uploads and results.
+    stops = defaultdict[str | None, threading.Event](threading.Event)
+    folders = defaultdict[str | None, set[Path]](set)
     fixed = (panels.tabs, panels.pixel, panels.add, panels.clear)
     shows = [component for component in vars(panels).values() if component not in fixed]
 
@@ -165,9 +182,13 @@ def _wire_run(
         return look.BUSY
 
     def stop(request: gr.Request) -> str:
-        if request.session_hash in stops:
-            stops[request.session_hash].set()
+        stops[request.session_hash].set()
         return look.STOPPED
+
+    def leave(request: gr.Request) -> None:
+        stop(request)
+        stops.pop(request.session_hash)
+        _delete(folders.pop(request.session_hash, ()))
 
     def nothing(status: str) -> dict[Any, Any]:
         """No result, and why."""
@@ -183,9 +204,11 @@ def _wire_run(
         (*filled, before, opened), visitor = values, request.session_hash
         _forget(before)
         try:
-            wanted, ended = form.options(tuple(filled)), stops.setdefault(visitor, threading.Event())
+            wanted, ended = form.options(tuple(filled)), stops[visitor]
+            folders[visitor] |= _uploads(wanted)
             with turn:
                 job = run_job(wanted, priors, ended, progress)
+            folders[visitor].add(job.folder.path)
             return {state: job, points: [], **_everything(panels, job, opened)}
         except Stopped:
             return nothing(look.STOPPED)
@@ -213,7 +236,7 @@ def _wire_run(
     files = [field for field in fields if hasattr(field, "upload")]
     changes = [event for field in files for event in (field.upload, field.clear)]
     gr.on(changes, None, js=look.CHANGED, queue=False)
-    return stop
+    return leave
 
 
 def _wire_panels(panels: SimpleNamespace, state: gr.State, points: gr.State, tab: gr.State) -> None:

@@ -1,6 +1,7 @@
 """The Space's app, started as the Space starts it and asked through gradio's own client."""
 
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ SPACE = Path(__file__).resolve().parents[2] / "examples" / "space"
 def address(tmp_path):
     pytest.importorskip("gradio", reason="gradio is not installed")
     port = free_port()
-    environment = {"GRADIO_SERVER_PORT": str(port)}
+    (tmp_path / "server").mkdir()
+    environment = {"GRADIO_SERVER_PORT": str(port), "TMPDIR": str(tmp_path / "server")}
     with served([sys.executable, "app.py"], port, tmp_path, environment, cwd=SPACE) as url:
         yield url
 
@@ -47,8 +49,14 @@ def test_it_answers_the_client(address, tmp_path):
         calibration: [K],
     }
     answer = client.predict(**given, api_name="/estimate")
+    kept = {path.name for path in (tmp_path / "server").rglob("*.npy")}
     client.close()
-    assert "median depth" in str(answer[0])
+    assert kept and "median depth" in str(answer[0])
     files = [entry for entry in answer if isinstance(entry, list) and "depth.npy" in str(entry)][0]
     depth_m = np.load(next(path for path in files if str(path).endswith("depth.npy")))
     assert np.median(np.abs(depth_m - true_m) / true_m) < 0.1
+    for _ in range(60):  # the server notices within seconds that the visitor has left
+        if not list((tmp_path / "server").rglob("*.npy")):
+            return
+        time.sleep(0.5)
+    pytest.fail("what a visitor got is still there")
