@@ -5,8 +5,8 @@
 >>> depth_m = out.prediction  # (1, H, W, 1), metres
 
 The method follows GeoDiff (arXiv 2510.18291). Read the code along the path of one image: ``types``,
-``geometry``, ``config``, ``matching``, ``scale``, ``algorithm``, ``guidance``, ``priors``,
-``runtime``.
+``geometry``, ``config``, ``matching``, ``pose``, ``scale``, ``algorithm``, ``guidance``,
+``priors``, ``runtime``.
 """
 
 from __future__ import annotations
