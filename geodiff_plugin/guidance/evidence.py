@@ -1,4 +1,4 @@
-"""Photographs cleaned, their poses refined or estimated, and ``Evidence`` made of them and remembered."""
+"""Clean photographs, refine or estimate their poses, make ``Evidence`` of them, and cache it."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from geodiff_plugin.guidance.inputs import Inputs, as_points
 from geodiff_plugin.matching import clean
 from geodiff_plugin.pose.estimate import Scale, estimate_poses, find_scale, polished
 from geodiff_plugin.pose.refine import refine_views, untouched
-from geodiff_plugin.pose.solve import depth_spread, open_pose
+from geodiff_plugin.pose.solve import depth_spread, undetermined_pose
 from geodiff_plugin.pose.tracks import coarse_depth, grey_views
 from geodiff_plugin.types import CameraView
 
 
 def cleaned(image_01: Tensor, config: GuidanceConfig) -> Tensor:
-    """A photograph ``(3, H, W)`` in [0, 1] of native size, as the knob ``clean_photographs`` says."""
+    """A photograph ``(3, H, W)`` in [0, 1] of native size, without flaws if ``clean_photographs`` is set."""
     return clean(image_01, config.sweep_pixels) if config.clean_photographs else image_01
 
 
@@ -37,7 +37,7 @@ def make_evidence(
 ) -> Evidence:
     """Clean the photographs, refine the poses, and prepare the ``Evidence`` of one native left image.
 
-    ``needs_matches``: the volume is checked against each view; ``measured``: the baselines' lengths are.
+    ``needs_matches``: match the volume against each view. ``measured``: the lengths of the baselines are.
     """
     views, K_left, points = given.on(left_01.device)
     if not views:
@@ -52,10 +52,10 @@ def make_evidence(
 
 
 class EvidenceStore:
-    """Remembers evidence by the values that it was made from, for every guidance whose store it is."""
+    """A cache of evidence by the values that it was made from; several guidances may share it."""
 
     def __init__(self, size: int = 2, copies: bool = True) -> None:
-        """Of the last ``size`` images, some 100 MB each; without copies nobody may change them in place."""
+        """Keep the last ``size`` images, some 100 MB each; without ``copies`` they must not be changed."""
         self._size, self._copies, self._spared = size, copies, 0.0
         # Tensors and settings that an entry was made from, the entry, and the seconds that it took.
         self._entries: list[tuple[list[Tensor | None], tuple[Any, ...], Evidence, float]] = []
@@ -87,7 +87,7 @@ class EvidenceStore:
         return evidence
 
     def take_spared_seconds(self) -> float:
-        """Seconds saved since the last call of this; a fair account of time adds them."""
+        """Seconds that the cache saved since the last call of this method; benchmarks add them."""
         spared, self._spared = self._spared, 0.0
         return spared
 
@@ -100,7 +100,7 @@ def _equal(a: Tensor | None, b: Tensor | None) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class EstimatedRig:
-    """Cameras of photographs that came without poses; numbers of several are of the right views."""
+    """Cameras of photographs without given poses; tuples after ``Ks`` have one entry per right view."""
 
     size_left: tuple[int, int]  # (width, height) of the left photograph
     Ks: tuple[np.ndarray, ...]  # (3, 3) each, left one first
@@ -142,8 +142,8 @@ def _cameras(
     return Ks, notes
 
 
-def _listed(points: Tensor, K_left: Tensor, size: tuple[int, int]) -> np.ndarray:
-    """Points ``(N, 3)`` as they are, or those of a depth map of the left photograph, of any resolution."""
+def _as_cloud(points: Tensor, K_left: Tensor, size: tuple[int, int]) -> np.ndarray:
+    """Points ``(N, 3)`` unchanged; a depth map of the left photograph, of any resolution, unprojected."""
     if points.shape[1] == 3:
         return points.double().numpy()
     K = resize_intrinsics(K_left[None], size, image_size(points))
@@ -171,7 +171,7 @@ def estimate_rig(
         check_number(baseline_m, "baseline_m", 1e-6, 1e6)
     K_left = torch.as_tensor(Ks[0], dtype=torch.float32, device="cpu")
     size = image_size(images[0])
-    cloud = None if points is None else _listed(as_points(points, "points"), K_left, size)
+    cloud = None if points is None else _as_cloud(as_points(points, "points"), K_left, size)
     images = [cleaned(image, DEFAULT) for image in images]
 
     def posed(Ts: Iterable[np.ndarray]) -> list[CameraView]:
@@ -200,5 +200,5 @@ def estimate_rig(
         spread,
         scale,
         tuple(notes),
-        (*(s for pose in poses for s in pose.warnings), *open_pose(spread), *scale.warnings),
+        (*(s for pose in poses for s in pose.warnings), *undetermined_pose(spread), *scale.warnings),
     )

@@ -61,10 +61,10 @@ class GeometryGuidance:
             weighed against the depth of the scene under the given poses. A rectified rig's is measured.
         previous: the output of the previous frame, called with ``output_latent=True``. The call then starts
             in the middle of the schedule, from that latent, and the scale search starts at that scale.
-        preset: hyperparameters by name: ``"default"``, ``"paper"``, ``"marigold-dc"``, ``"search-only"`` or
-            ``"prior-fit"``.
+        preset: hyperparameters by name: ``"default"``, ``"fast"``, ``"paper"``, ``"marigold-dc"``,
+            ``"search-only"`` or ``"prior-fit"``.
         config: hyperparameters in place of a preset.
-        **knobs: hyperparameters to change in them, such as ``inner_steps=10``; docs/reference/knobs.md and
+        **knobs: hyperparameters to change in either, such as ``inner_steps=10``; docs/reference/knobs.md and
             ``geodiff info --knobs`` list them.
 
     Attributes:
@@ -73,8 +73,8 @@ class GeometryGuidance:
         evidence_store: cache of cost volumes and matches for further calls with the same images, cameras and
             settings; ``None``, the default, for no cache.
         estimated: cameras estimated by ``from_photographs``; ``None`` where poses were given.
-        warned: every warning of the construction, and whether a result with it is not to be trusted.
-        assumed: sentences on what nobody gave.
+        warned: every warning of the construction, and whether it makes the result untrusted.
+        assumed: sentences on inputs that were assumed because they were not given.
 
     Raises:
         InputError: an argument of the wrong type, rank, size or range, or a pose that is not rigid. It is a
@@ -171,8 +171,8 @@ class GeometryGuidance:
             **arguments: further arguments of the constructor.
 
         Raises:
-            InputError: also for images of another size than the calibration's; the left one when it is
-                called.
+            InputError: also for images of another size than the calibration's; the left image is checked
+                when the pipeline is called.
         """
         size = arguments.get("left_size")
         with noted() as warned:
@@ -234,7 +234,7 @@ class GeometryGuidance:
         """Two or more photographs without poses, which are estimated from matches (extra ``pose``).
 
         Args:
-            left: the photograph to estimate the depth of; or a list of three or more photographs, it first.
+            left: the photograph to estimate the depth of; or a list of photographs that starts with it.
             right: the second photograph; ``None`` with a list.
             baseline_m: distance between the left camera and the first right one, metres.
             K: ``(3, 3)`` intrinsics of all photographs in pixels, or a list with one each. ``None`` takes
@@ -340,7 +340,7 @@ class GeometryGuidance:
         for i, (left_01, given) in enumerate(zip(lefts_01, self.inputs, strict=True)):
             if not self._cropped:
                 check_size_of(given.K_left, size, "K" if count == 1 else f"K[{i}]", "the left image")
-            with WithinCores():  # here too, for calls outside of a guided one
+            with WithinCores():  # ``prepare`` may be called outside of a guided call
                 evidence.append(make(left_01, given, self.config, needs_matches, self.measured_baseline))
         return evidence
 
@@ -352,7 +352,7 @@ def assume_same_centre(guidance: GeometryGuidance) -> None:
 
 
 def _check_sufficient(config: GuidanceConfig, updates: UpdatePlan, *, views: bool, points: bool) -> None:
-    """Refuse a configuration whose search, or whose every weighted term, lacks what it works on."""
+    """Refuse a configuration whose search or whose weighted terms all need an input that was not given."""
     if config.search == "one-number" and not (views and config.weights.get("photometric")):
         refuse("search='one-number' needs a right view and a photometric weight; search='volume' does not.")
     if config.search == "points-range" and not points:

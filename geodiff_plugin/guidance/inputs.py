@@ -1,4 +1,4 @@
-"""What the user gives, in any of its forms, checked: left image, views, cameras, points (S3.3)."""
+"""Read and check the user's input in any of its forms: left image, views, cameras, points (S3.3)."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def read_inputs(
     lists = [x for x in (right, points) if isinstance(x, list) and not _is_nested_matrix(x)]
     count = len(lists[0]) if lists else 1
     if right is not None and not isinstance(right, list) and count == 1:
-        # A list of matrices beside one left image is the tuple of cameras that is meant.
+        # With one left image a list of matrices can only mean the tuple of cameras.
         K, E = (
             tuple(x) if isinstance(x, list) and len(x) > 1 and not _is_nested_matrix(x) else x for x in (K, E)
         )
@@ -91,7 +91,7 @@ def read_inputs(
 def _read_image(
     right: Any, K: Any, E: Any, points: Tensor | None, label: str, cropped: bool, unit: str | None
 ) -> Inputs:
-    """The entry of one left image; ``label`` makes the names in messages."""
+    """The entry of one left image; ``label`` formats argument names for messages."""
     given = right if isinstance(right, tuple) else () if right is None else (right,)
     count, name = len(given), label.format("right")
     names = [name if count == 1 else f"{name}, view {v + 1}," for v in range(count)]
@@ -123,7 +123,7 @@ def _entry(value: Any, name: str, i: int, count: int) -> Any:
     if not isinstance(value, list) or _is_nested_matrix(value):
         return value
     if len(value) != count:
-        bad_value(name, f"a list of {count} entries, one per right image", f"{len(value)} entries")
+        bad_value(name, f"a list of {count} entries, one per left image", f"{len(value)} entries")
     return value[i]
 
 
@@ -168,7 +168,7 @@ def _poses(E: Any, name: str, views: int, unit: str | None) -> list[np.ndarray]:
 def as_points(value: Any, name: str, confidence: Any = None) -> Tensor:
     """``(N, 3)`` of finite rows, or ``(H, W)`` with 0 where unknown, float32, metres.
 
-    A ``confidence`` in [0, 1], ``(N,)`` or ``(H, W)``, becomes the last channel; what has none is unknown.
+    A ``confidence`` in [0, 1], ``(N,)`` or ``(H, W)``, becomes the last channel; 0 marks unknown depth.
     """
     forms = "a sparse depth map (H, W) or points (N, 3) in the left camera's frame, metres"
     if isinstance(value, Tensor):
@@ -184,7 +184,7 @@ def as_points(value: Any, name: str, confidence: Any = None) -> Tensor:
         bad_value(name, forms, f"shape {array.shape}")
     if array.shape[1] in (4, 6):  # with an intensity, or a colour; no image is that narrow
         array = array[:, :3]
-    if array.shape[1] != 3 or not isinstance(value, (list, tuple)):  # whole metres typed by hand are meant so
+    if array.shape[1] != 3 or not isinstance(value, (list, tuple)):  # a typed list is in metres
         check_metres(array, name)
     array, is_cloud = array.astype(np.float32), array.shape[1] == 3
     known = np.isfinite(array).all(1) if is_cloud else np.isfinite(array) & (array > 0)
@@ -203,7 +203,7 @@ def as_points(value: Any, name: str, confidence: Any = None) -> Tensor:
 
 
 def _as_confidence(value: Any, points: np.ndarray, name: str) -> np.ndarray:
-    """The confidence of points ``(N, 3)`` or of a map ``(H, W)``, float32 in [0, 1]; not finite is 0."""
+    """The confidence of points ``(N, 3)`` or of a map ``(H, W)``, float32 in [0, 1]; not finite becomes 0."""
     shape = (len(points),) if points.shape[1] == 3 else points.shape
     try:
         array = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value, dtype=np.float32)
@@ -256,7 +256,7 @@ def left_images(image: Any) -> Tensor:
 
 
 def _named(image: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """Every single image with its name in messages; of a batch with its index."""
+    """Every single image with its name for messages, which has an index in a batch."""
     several = isinstance(image, list)
     if isinstance(image, (np.ndarray, Tensor)):
         several = image.ndim == 4

@@ -1,4 +1,4 @@
-"""Poses of photographs by PoseLib (Larsson), their scale by a known length, or why there is none."""
+"""Estimate poses of photographs by PoseLib (Larsson), and their scale from a known length."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.pose.solve import FREE_PX, SCALE_PX, Prior, solve_poses
+from geodiff_plugin.pose.solve import FREE_PX, SCALE_PX, PosePrior, solve_poses
 from geodiff_plugin.pose.tracks import (
     GreyViews,
     Tracks,
@@ -25,23 +25,23 @@ from geodiff_plugin.pose.tracks import (
     sparse_tracks,
 )
 
-#: An inlier lies nearer to its epipolar line, or to its place under a simpler motion, than this.
+#: An inlier lies nearer than this to its epipolar line, or to its position under a simpler motion.
 INLIER_PX = 2.0
 #: Fewer inliers, or a smaller share of the matches, make no pose.
 FEWEST_INLIERS, LEAST_SHARE = 30, 0.3
-#: Median angle between the two rays of a point below which no depth is to be had, and below which little.
+#: Median angle between the two rays of a point below which depth is refused, and is inaccurate.
 NO_PARALLAX_DEG, LITTLE_PARALLAX_DEG = 0.3, 0.6
-#: Rows that agree this well, without any turn, are those of a rectified pair.
+#: A pair is rectified if its rows agree this well without any rotation.
 RECTIFIED_PX = 0.45
-#: A simpler motion that explains this share of the inliers is the motion.
+#: A simpler motion that explains this share of the inliers is preferred.
 SIMPLER = 0.9
-#: Matches this far from their lines are no noise of the pose; a second motion that explains this share
-#: of all matches, and of those, is one of the scene. Above the last, as a share of the first motion's
-#: matches, nobody can tell which of the two the camera made.
+#: Matches this far from their lines are not explained by noise. A second motion that explains this share of
+#: all matches, and this share of those, is one of the scene. Above the last number, as a share of the first
+#: motion's matches, either motion may be the camera's.
 APART_PX, SECOND_SHARE, SECOND_OF_REST, RIVAL = 6.0, 0.1, 0.5, 0.45
-# Robust scales of the last fits, pixels: nothing but the matches holds an estimated pose.
+# Robust scales of the last fits, pixels: only matches determine an estimated pose.
 _NARROWER_PX = (0.3, 0.15, 0.08)
-# A pixel's depth is that of the matches this near, pixels of their grid.
+# The depth of a pixel is that of the matches this near, pixels of their grid.
 _NEAR_PX = 40.0
 NO_UNIT = (
     "No length is known, so the result has no unit: all depths are in baselines of the first two cameras. "
@@ -57,7 +57,7 @@ class EstimatedPose:
     inliers: np.ndarray  # (N,) bool, the tracks that it explains
     parallax_deg: float  # median angle between the two rays of an inlier
     residual_px: float  # median distance of the inliers from their epipolar lines
-    rectified: bool  # all rows agree, which those of two photographs by hand do not by chance
+    rectified: bool  # all rows agree
     warnings: tuple[str, ...]  # sentences for the user
 
 
@@ -73,7 +73,7 @@ def _parallax_deg(tracks: Tracks, R: np.ndarray) -> np.ndarray:
 
 
 def estimate_pose(tracks: Tracks, name: str = "the two photographs") -> EstimatedPose:
-    """Rotation and direction of the baseline of one right view, by tracks with outliers."""
+    """Rotation and direction of the baseline of one right view, from tracks with outliers."""
     if len(tracks) < FEWEST_INLIERS:
         cure = (
             "Are they of the same place, sharp and well lit, none of them a mirror image (a selfie)? Half of "
@@ -228,9 +228,9 @@ def polished(views: GreyViews, Ts: np.ndarray, depth_m: Tensor, sparse: Tracks) 
     ``depth_m`` is as ``dense_tracks`` takes it. Returns the poses, the first baseline as long as it was, and
     all matches.
     """
-    Ts = Ts.astype(np.float32).astype(np.float64)  # those that the depth was made with
+    Ts = Ts.astype(np.float32).astype(np.float64)  # the precision that the depth was made with
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, Ts)])
-    free = Prior(np.full(len(Ts), FREE_PX), np.radians(3.0), 0.3, 0.02 if len(Ts) == 1 else 0.2)
+    free = PosePrior(np.full(len(Ts), FREE_PX), np.radians(3.0), 0.3, 0.02 if len(Ts) == 1 else 0.2)
     solved = Ts
     for scale_px in (SCALE_PX, *_NARROWER_PX):
         solved = solve_poses(tracks, Ts, free, start=solved, scale_px=scale_px)

@@ -35,25 +35,25 @@ _FOCAL_SCALED = (
     "for images of {size:.3g} times the width and height of these, its principal point set to the middle."
 )
 _FACTORS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 2, 2.0, 3.0, 4.0)
-# Within so many pixels of its line, and in front of both cameras, a match speaks for a pose: coarsely, for a
-# mistaken pose may be inexact as well, and finely, for where the cameras are close together a wrong K or pose
-# too leaves most matches within a few pixels of their lines.
+# A match supports a pose if it lies in front of both cameras and this near to its epipolar line, pixels:
+# coarsely, because a mistaken pose may be inexact as well, and finely, because with a short baseline even a
+# wrong K or pose leaves most matches within a few pixels of their lines.
 _NEAR_PX = (4.0, 1.5)
-# A mistake explains so many times the matches that the given pose does, this share of all, and this share of
-# what the pose nearby does.
+# A mistake must explain more matches than the given pose by this factor, this share of all matches, and this
+# share of those that the nearby pose explains.
 _CLEARLY, _AT_LEAST, _NEARLY = 2.0, 0.5, 0.85
-# An inexact pose may look so too: another K or other axes can bring it near the matches, but not onto them.
-# So either the median residual must be that of the pose nearby, but for this factor, or the candidate must
-# lie this far from the given pose, in degrees or shares of the baseline, or have another K. Where only the
-# fine shares tell it from the given pose, both must hold.
+# An inexact pose may look like a mistake: another K or other axes can bring it near the matches, but not onto
+# them. So either the median residual must be within this factor of the nearby pose's, or the candidate must
+# lie this far from the given pose, in degrees or shares of the baseline, or have another K. If only the fine
+# shares distinguish it from the given pose, both must hold.
 _AS_EXACT, _FAR_DEG, _FAR_SHIFT = 1.2, 5.0, 0.8
 # Candidates whose share is this near the largest are told apart by a finer measure.
 _ALIKE = 0.95
-#: A baseline from this on may be centimetres or millimetres, where what it shows is as large.
+#: A longer baseline, with a scene as far away, may be in centimetres or millimetres.
 SUSPECT_BASELINE_M = 5.0
 
 _Fit = tuple[tuple[float, ...], float]
-"""Shares of the matches that speak for a pose, coarsely and finely, and their median residual, pixels."""
+"""Shares of the matches that support a pose, coarsely and finely, and their median residual, pixels."""
 
 
 def _fit(tracks: Tracks, T: np.ndarray) -> _Fit:
@@ -82,8 +82,8 @@ def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[str, Tracks, np
             Ks[:, :2, :2] *= factor
             if sentence == _K_SCALED:
                 Ks[:, :2, 2] = (Ks[:, :2, 2] + 0.5) * factor - 0.5
-            told = sentence.format(factor=factor, size=1 / factor)
-            yield told, replace(tracks, K_left=Ks[0], K_rights=Ks[1:]), T
+            text = sentence.format(factor=factor, size=1 / factor)
+            yield text, replace(tracks, K_left=Ks[0], K_rights=Ks[1:]), T
 
 
 def pose_change(given: np.ndarray, Ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -95,9 +95,9 @@ def pose_change(given: np.ndarray, Ts: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _likeliest(tracks: Tracks, T: np.ndarray) -> tuple[str, _Fit, bool]:
-    """The mistake with the largest share of matches, of several alike the one that also fits more finely.
+    """The mistake with the largest share of matches; among similar ones that with the best fine fit.
 
-    With its fit, and whether the given pose is too far from it to be an inexact one.
+    Also its fit, and whether the given pose is too far from it to be merely inexact.
     """
     candidates = []
     for sentence, changed, pose in _candidates(tracks, T):
@@ -131,9 +131,8 @@ def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
 def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:
     """A sentence where baseline and scene are both a hundred or a thousand times too large, or ``None``.
 
-    Only the size of what comes out shows the unit of a translation. A baseline above ``LONG_BASELINE_M`` was
-    warned of when it was given. Nearer scenes are left in peace: from 100 m above the ground a drone moves on
-    by as much as centimetres taken for metres would be.
+    Only the resulting depths show the unit of a translation. ``check_baseline`` has warned of baselines above
+    ``LONG_BASELINE_M``. Nearer scenes pass: 100 m above ground drones take such steps.
     """
     baseline = float(np.linalg.norm(T[:3, 3]))
     inverse_depth = solve_inverse_depth(tracks, T[None])

@@ -1,7 +1,7 @@
 """Checks given poses against the images, and refines them where they do not fit.
 
-A pose that fits already is used bit for bit. What no pose explains (rolling shutter, lens distortion, errors
-of K) is taken out of the right image afterwards, by a smooth displacement across the epipolar lines.
+A pose that fits is used bit for bit. Errors that no pose explains (rolling shutter, lens distortion, K) are
+removed from the right image afterwards, by a smooth displacement across the epipolar lines.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from geodiff_plugin.pose.tracks import (
 )
 from geodiff_plugin.types import CameraView, PoseReport
 
-#: A pose whose matches lie nearer than this to their epipolar lines, in the median, is left as it is: that of
-#: a rectified rig, whose lenses leave as much, and any other, of which a shift may hide most of a wrong turn.
+#: A pose fits if its matches lie nearer than this to their epipolar lines, in the median: that of a rectified
+#: rig, whose lenses cause errors as large, and any other, where a shift may hide most of a wrong rotation.
 FITS_PX, POSED_FITS_PX = 0.45, 0.3
-#: Above this, as given, the user is told.
+#: The user is warned if the given pose has a larger residual than this.
 WARNS_PX = 1.0
-# A refinement must gain this share of the residual, and may turn and shift a camera so far.
+# A refinement must remove this share of the residual, and may turn and shift a camera by this much at most.
 _LEAST_GAIN, _MOST_TURN_DEG, _MOST_SHIFT = 0.1, 8.0, 0.8
 #: Relative standard deviation, under the poses of a tracker, of the distance between two cameras and of the
 #: scene's median depth; measured on 85 pairs of two trackers (docs/how-to/poses.md).
@@ -45,9 +45,9 @@ LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.05
 MOST_SCALE_SPREAD = 0.1
 # The user is warned if the pose that fits best changes log depth by more than this, in the median.
 _MOST_SPREAD = 0.13
-# Straightening: residual from which on a match counts for less, pixels; pull of the 20 coefficients towards
-# 0, in matches; fewest matches; side of the blocks that are left out in turn, in shares of the image's width;
-# by which share left-out matches must come nearer to their lines.
+# Straightening: residual above which a match counts for less, pixels; pull of the 20 coefficients towards 0,
+# in matches; fewest matches; side of the blocks for cross-validation, as a share of the image's longer side;
+# share by which the residual of left-out matches must fall.
 _BENT_PX, _RIDGE, _FEWEST_BENT, _BLOCK, _LEAST_BENT_GAIN = 0.5, 3.0, 80, 1.0 / 6.0, 0.05
 
 _CAUSES = (
@@ -61,7 +61,7 @@ _Refined = tuple[tuple[CameraView, ...], PoseReport]
 
 
 def untouched(rights: Sequence[CameraView], status: str = "given") -> _Refined:
-    """The views as they were given, and a report that says why."""
+    """The views as given, and a report with that status."""
     poses = _as_E(_poses(rights))
     return tuple(rights), PoseReport(status, poses, poses)
 
@@ -75,10 +75,10 @@ def refine_views(
 ) -> _Refined:
     """Check the poses against the images ``(3, H, W)`` in [0, 1], and refine them where they do not fit.
 
-    Lengths in the ``unit`` metres are questioned where they seem to be in millimetres. ``measured`` baselines
-    keep their lengths, as those of a rectified rig do; others are weighed against the depth of the scene.
-    The right views are the very ones that were given where the poses fit, where there are too few matches,
-    where a mistake explains the misfit, or where no better pose is near.
+    Lengths in metres (``unit``) are questioned if they look like millimetres. ``measured`` baselines keep
+    their lengths, as those of a rectified rig do; others are weighed against the depth of the scene. The
+    given views are returned if the poses fit, if there are too few matches, if a mistake explains the misfit,
+    or if no better pose is near.
     """
     views, given = grey_views(left_01, rights, K_left), _poses(rights)
     sparse = sparse_tracks(views)
@@ -106,8 +106,8 @@ def refine_views(
     report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
     doubts, spread = undecided(tracks, Ts, free), None
     if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
-        told = _told(before, worst, ", and no pose near it leaves clearly less. ")
-        return tuple(rights), replace(report, status="kept", warnings=told + doubts + units)
+        sentences = _misfit(before, worst, ", and no pose near it leaves clearly less. ")
+        return tuple(rights), replace(report, status="kept", warnings=sentences + doubts + units)
     if far := _too_far(before, after, *pose_change(given, Ts)):
         return tuple(rights), replace(report, status="kept", warnings=(*filter(None, far), *units))
     if not (rig or measured):
@@ -122,7 +122,7 @@ def refine_views(
     report = replace(
         report,
         status="refined",
-        warnings=_told(before, worst, f", a refined one {after[worst]:.1f} px. ") + doubts + units,
+        warnings=_misfit(before, worst, f", a refined one {after[worst]:.1f} px. ") + doubts + units,
         scale_spread=spread,
         E=_as_E(Ts),
         residual_px=tuple(median_residuals(replace(tracks, right_px=straight), Ts).tolist()),
@@ -132,13 +132,13 @@ def refine_views(
 
 
 def refined_scale(refined: np.ndarray, given: np.ndarray, misfit: float) -> tuple[float, float]:
-    """By how much to multiply refined translations, and its relative standard deviation; NaN for none ahead.
+    """Factor on refined translations, and its relative standard deviation; NaN if no point is in front.
 
-    Two lengths survive a refinement: that of the baseline, and the depth of the scene, for a tracker errs in
-    turn and shift together. The result is their mean, weighted by their uncertainties. ``refined`` and
-    ``given (N,)`` are inverse depths under the refined poses, with baselines as long as given, and under the
-    given ones. ``misfit`` is the distance of the matches from their epipolar lines as a share of their
-    parallax, in the median: as much error is expected along the lines, where it changes depth.
+    Two given lengths fix the scale: that of the baseline, and the depth of the scene, since a tracker's
+    errors of rotation and shift compensate. The result is their mean, weighted by uncertainty. ``refined``
+    and ``given (N,)`` are inverse depths under the refined poses, with the given lengths, and under the given
+    poses. ``misfit`` is the median distance of matches from their epipolar lines over their median parallax:
+    as much error is expected along the lines, where it changes depth.
     """
     ahead = (refined > 0) & (given > 0)
     if not ahead.any():
@@ -221,13 +221,13 @@ def fit_displacement(tracks: Tracks, T: np.ndarray, size: tuple[int, int]) -> Di
     off, normals = across_lines(tracks, T)
     basis = _cubic(tracks.right_px[0], size)
     block = (tracks.left_px // (_BLOCK * max(size))).sum(1) % 2 == 0
-    told = np.empty(len(off))
+    predicted = np.empty(len(off))
     for part in (block, ~block):
         if part.sum() < _FEWEST_BENT // 4:
             return None
         fit = _fit_cubic(basis[part], normals[part], off[part])
-        told[~part] = ((basis[~part] @ fit) * normals[~part]).sum(1)
-    if np.median(np.abs(off - told)) > (1.0 - _LEAST_BENT_GAIN) * np.median(np.abs(off)):
+        predicted[~part] = ((basis[~part] @ fit) * normals[~part]).sum(1)
+    if np.median(np.abs(off - predicted)) > (1.0 - _LEAST_BENT_GAIN) * np.median(np.abs(off)):
         return None
     coefficients = _fit_cubic(basis, normals, off)
     lengths = np.linalg.norm(basis @ coefficients, axis=1)
@@ -270,7 +270,7 @@ def _applied(
 
 
 def _sentences(tracks: Tracks, ask: Callable[..., str | None], *poses: np.ndarray) -> tuple[str, ...]:
-    """What ``ask`` says about every view that has matches, each sentence once."""
+    """The sentences of ``ask`` about every view that has matches, each once."""
     views = [(tracks.view(v), *of_view) for v, of_view in enumerate(zip(*poses, strict=True))]
     said = [ask(*view) for view in views if len(view[0]) >= FEWEST]
     return tuple(dict.fromkeys(sentence for sentence in said if sentence))
@@ -289,8 +289,8 @@ def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[str, ..
     )
 
 
-def _told(before: np.ndarray, v: int, rest: str) -> tuple[str, ...]:
-    """A sentence on the misfit of view ``v``, where one is large; ``rest`` ends it."""
+def _misfit(before: np.ndarray, v: int, rest: str) -> tuple[str, ...]:
+    """A sentence on the misfit of view ``v`` that ends with ``rest``; none if no misfit is large."""
     if not np.nanmax(before) > WARNS_PX:
         return ()
     pose = "The pose as given" if len(before) == 1 else f"The pose of right view {v + 1} as given"
@@ -301,13 +301,13 @@ def _told(before: np.ndarray, v: int, rest: str) -> tuple[str, ...]:
 def _too_far(
     before: np.ndarray, after: np.ndarray, turned_deg: np.ndarray, shifts: np.ndarray
 ) -> tuple[str, ...]:
-    """What is said of poses too far from the given ones to be used, or an empty sentence; ``()`` for none."""
+    """A sentence on poses too far from the given ones to be used, maybe empty; ``()`` if none is too far."""
     far = ~((turned_deg < _MOST_TURN_DEG) & (shifts < _MOST_SHIFT))
     if not far.any():
         return ()
-    v = int(np.lexsort((np.nan_to_num(before), far & ~np.isnan(before)))[-1])  # of those too far, the worst
+    v = int(np.lexsort((np.nan_to_num(before), far & ~np.isnan(before)))[-1])  # the worst of those too far
     rest = (
         f". A pose {turned_deg[v]:.0f} degrees and {100 * shifts[v]:.0f} % of the baseline away fits to "
         f"{after[v]:.1f} px, but is too far from the given one and was not used. "
     )
-    return _told(before, v, rest) or ("",)
+    return _misfit(before, v, rest) or ("",)

@@ -26,28 +26,27 @@ from geodiff_plugin.pose.tracks import (
     split_residuals,
 )
 
-#: Robust scale of a fit whose noise is not known yet, pixels of the right view.
+#: Robust scale of a fit before its noise is known, pixels of the right view.
 SCALE_PX = 0.7
-#: A prior as wide as this leaves a pose free, but for the length of its baseline.
+#: A pose prior this wide leaves a pose free, except for the length of its baseline.
 FREE_PX = 1e3
-#: The user is warned if the depth that rests on an estimated pose is less certain than this.
+#: The user is warned if an estimated pose leaves depth a larger relative standard deviation than this.
 MOST_SPREAD = 0.06
 _STEPS = 12
-# How far a refined pose may move the points, along their lines as well: the residual that it explains, times
-# a share. The share is 1 where that residual is so many times the cameras' other faults (a rolling shutter,
-# lenses, K), which are what the residuals of neighbours have in common. It grows with the fourth power:
-# below, a free pose would hide those faults; above, the given pose was wrong.
+# How far a refined pose may move the points, also along their lines: the residual that it explains times a
+# share. The share is 1 where that residual is the first number times the cameras' other errors (rolling
+# shutter, lenses, K), which residuals of neighbours have in common. It grows with the fourth power of that
+# ratio, within bounds: below, a free pose would hide those errors; above, the given pose was wrong.
 _FAULTS, _MOVED_SHARE = 5.6, (0.2, 40.0)
 _FLOOR_PX, _LEAST_FAULT_PX = 0.05, 0.03
-# A rectified pair has a share and a narrow prior of its own: its cameras are bolted together, turn by tenths
-# of a degree and hardly shift, and a pan that fits the rows better is more often a fault of the lenses.
+# A rectified pair has another share and a narrower prior: its cameras are bolted together, turn by tenths
+# of a degree and hardly shift, and a pan that fits the rows better is more often an error of the lenses.
 _RIG_MOVED_SHARE, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE = 0.4, np.radians(0.3), 0.01
-# The robust scale after the first fit is so many times the residual that the first one leaves, but not below
-# a tenth of a pixel; and residuals count half, because blocks of the image do not show all that neighbours
-# have in common.
+# Robust scale after the first fit, as a factor on its residual and at least in pixels; weight of residuals,
+# a half, because blocks of the image do not show all that neighbours have in common.
 _SCALE_BY, _LEAST_SCALE_PX, _COUNTS = 2.0, 0.1, 0.5
-# Where the given pose was wrong, little but the matches holds the new one, and narrower fits follow: what
-# most of them agree on is nearer the truth than what all of them are least far from.
+# If the given pose was wrong, only the matches determine the new one, and narrower fits follow: what most
+# matches agree on is nearer to the truth than the best compromise between all.
 _NARROWER_BY = (1.0, 0.5)
 
 _Terms = tuple[float, np.ndarray, np.ndarray]
@@ -55,11 +54,11 @@ _Terms = tuple[float, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Prior:
-    """How far the poses as given are believed, as standard deviations.
+class PosePrior:
+    """Standard deviations of the given poses.
 
-    What two views cannot determine, above all the baseline's length and a turn that a shift compensates,
-    stays as given: such a move costs here and gains nothing in the residuals.
+    What two views cannot determine, above all the baseline's length and a rotation that a shift compensates,
+    stays as given: such a change costs here and does not lower the residuals.
     """
 
     moved_px: np.ndarray  # (V,) of where the tracks' points project to
@@ -97,7 +96,7 @@ class _Whitened(NamedTuple):
 
 
 def _whitened(tracks: Tracks, Ts: np.ndarray, scale_px: float) -> _Whitened:
-    """What the tracks say about poses ``Ts``; from ``scale_px`` on an observation counts for less."""
+    """Residuals of the tracks under poses ``Ts``; above ``scale_px`` an observation counts for less."""
     views = len(Ts)
     w = solve_inverse_depth(tracks, Ts)
     for _ in range(2 if views > 1 else 0):
@@ -129,7 +128,9 @@ def _weights(
     return weights, offs, ats
 
 
-def _prior_terms(tracks: Tracks, Ts: np.ndarray, given: np.ndarray, w: np.ndarray, prior: Prior) -> _Terms:
+def _prior_terms(
+    tracks: Tracks, Ts: np.ndarray, given: np.ndarray, w: np.ndarray, prior: PosePrior
+) -> _Terms:
     """Cost, gradient and normal matrix of the prior."""
     size = 6 * len(Ts)
     cost, gradient, normal = 0.0, np.zeros(size), np.zeros((size, size))
@@ -156,7 +157,7 @@ def _prior_terms(tracks: Tracks, Ts: np.ndarray, given: np.ndarray, w: np.ndarra
 def solve_poses(
     tracks: Tracks,
     given: np.ndarray,
-    prior: Prior,
+    prior: PosePrior,
     *,
     start: np.ndarray | None = None,
     scale_px: float = 1.0,
@@ -201,7 +202,7 @@ def is_rig(tracks: Tracks, given: np.ndarray) -> bool:
 def nearby_poses(sparse: Tracks, given: np.ndarray, before: np.ndarray) -> np.ndarray:
     """Poses that fit the sparse matches, sought from far away first: then no match is an outlier yet."""
     before = np.nan_to_num(before, nan=1.0)
-    prior, Ts = Prior(1.5 * before + _FLOOR_PX), given
+    prior, Ts = PosePrior(1.5 * before + _FLOOR_PX), given
     for scale in (max(float(before.max()), 1.0), 1.0):
         Ts = solve_poses(sparse, given, prior, start=Ts, scale_px=scale)
     return Ts
@@ -210,7 +211,7 @@ def nearby_poses(sparse: Tracks, given: np.ndarray, before: np.ndarray) -> np.nd
 def settle_poses(
     tracks: Tracks, given: np.ndarray, near: np.ndarray, before: np.ndarray, rig: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses that fit all matches, held as firmly as the given ones turn out to deserve.
+    """Poses that fit all matches, kept the nearer to the given ones the better these fit.
 
     ``given`` and ``near (V, 4, 4)``, which fit roughly, are ``T_right_from_left``; ``before (V,)`` pixels,
     ``median_residuals`` of the poses as given; ``rig`` whether these are those of a rectified rig.
@@ -220,7 +221,7 @@ def settle_poses(
         cameras have faults that no pose explains, and where they are those of a rectified rig. And
         ``(V, 4, 4)``: those that fit best, but for the lengths of the baselines.
     """
-    free = Prior(np.full(len(given), FREE_PX), longer_share=0.02)
+    free = PosePrior(np.full(len(given), FREE_PX), longer_share=0.02)
     fitted = solve_poses(tracks, given, free, start=near, scale_px=SCALE_PX)
     left = np.maximum(median_residuals(tracks, fitted), _FLOOR_PX)
     explained = np.sqrt(np.clip(before**2 - left**2, 0.0, None))
@@ -231,7 +232,7 @@ def settle_poses(
     share = np.full_like(times, _RIG_MOVED_SHARE) if rig else np.clip(times**4, *_MOVED_SHARE)
     moved = np.maximum(np.nan_to_num(share * explained), _FLOOR_PX)
     counting = float(np.mean([part[0] for part in parts if part is not None]))
-    held = Prior(moved, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE) if rig else Prior(moved)
+    held = PosePrior(moved, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE) if rig else PosePrior(moved)
     wrong = not rig and bool((times > 1.0).any())
     settled = fitted
     for by in (_SCALE_BY, *(_NARROWER_BY if wrong else ())):
@@ -242,19 +243,19 @@ def settle_poses(
 
 
 def depth_spread(tracks: Tracks, Ts: np.ndarray) -> float:
-    """The relative standard deviation of a track's depth caused by errors of free poses ``Ts (V, 4, 4)``.
+    """The relative standard deviation of depth caused by errors of free poses ``Ts (V, 4, 4)``.
 
-    In the median of the tracks, which the poses fit best, outliers among them; ``inf`` where none lies in
-    front of the cameras. The covariance of the poses is the sandwich of robust statistics (Huber 1967; White
-    1982), with blocks of the image as what is independent: residuals of neighbours are alike. The unit of
-    length is taken as exact.
+    ``Ts`` are the best fit to the tracks, which may have outliers. The result is the median over the tracks;
+    ``inf`` if none lies in front of the cameras. The covariance of the poses is the sandwich of robust
+    statistics (Huber 1967; White 1982) over blocks of the image, because residuals of neighbours are not
+    independent. The unit of length is taken as exact.
     """
     at = _whitened(tracks, Ts, SCALE_PX)
     ahead = at.inverse_depth > 0
     if not ahead.any():
         return float("inf")
-    # Steps with translations in baselines, and without the one along all translations at once, which
-    # changes nothing but the unit.
+    # Steps with translations in baselines, without the one that scales all translations and only changes
+    # the unit.
     unit = np.tile(np.repeat([1.0, np.linalg.norm(Ts[0, :3, 3])], 3), len(Ts))
     longer = np.concatenate([np.r_[np.zeros(3), T[:3, 3]] for T in Ts]) / unit
     free = unit[:, None] * np.linalg.svd(longer[None])[2][1:].T
@@ -268,7 +269,7 @@ def depth_spread(tracks: Tracks, Ts: np.ndarray) -> float:
     return float(np.median(np.einsum("np,pq,nq->n", by_step, covariance, by_step)) ** 0.5)
 
 
-def open_pose(spread: float | None) -> tuple[str, ...]:
+def undetermined_pose(spread: float | None) -> tuple[str, ...]:
     """A sentence where the matches do not determine an estimated pose; none for ``None``."""
     if spread is None or spread <= MOST_SPREAD:
         return ()

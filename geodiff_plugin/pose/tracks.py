@@ -1,6 +1,6 @@
-"""Points of the left image with their places in the right ones, and how well poses explain them (Eq. 25).
+"""``Tracks``: left points matched in the right images, and their residuals under poses (Eq. 25).
 
-They are found by SIFT, and by optical flow after a first depth.
+They are matched by SIFT, and by optical flow once there is a first depth.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from geodiff_plugin.types import CameraView
 
 #: Longer side of the left image that matches are sought on, pixels; residuals are in pixels of this grid.
 LONG_SIDE = 832
-# SIFT. The nearest descriptor must be nearer than this share of the second nearest (Lowe 2004). The number of
-# points decides the time of matching. The contrast is low, so that blank walls give some points as well.
+# SIFT: ratio test of nearest and second nearest descriptor (Lowe 2004); upper bound on the points, which
+# bounds the time of matching; contrast threshold, low, so that blank walls give some points as well.
 _RATIO, _MOST_POINTS, _CONTRAST = 0.8, 4000, 0.01
-# Flow: one match a cell of so many pixels a side, whose grey has this standard deviation, of 255, or more.
-# Flow there and back may differ by so many pixels; flow further than that is no correction of a warp.
+# Flow: side of a cell, which gives one match, pixels; least standard deviation of its grey, of 255; bound on
+# the forward-backward difference, pixels; bound on the flow, which only corrects a warp.
 _CELL_PX, _LEAST_CONTRAST, _THERE_AND_BACK_PX, _FARTHEST_PX = 10, 2.0, 0.5, 24.0
-# Windows that spread reliable matches into holes, pixels of the coarse sweep; a wider one counts a hundredth.
+# Windows that spread matches into holes, pixels of the coarse sweep; each has a hundredth of the last weight.
 _WINDOWS = (3, 7, 15, 31, 63)
 # Least inverse depth, as a share of the largest.
 _FARTHEST = 1e-3
-#: Fewer matches than this say nothing about a pose.
+#: With fewer matches than this a pose is not checked.
 FEWEST = 40
 #: Blocks a row of the left image, for what neighbouring residuals have in common.
 _BLOCKS, _FEWEST_IN_BLOCK, _FEWEST_BLOCKS = 10, 5, 3
@@ -46,7 +46,7 @@ class Tracks:
 
     left_px: np.ndarray  # (N, 2) float64
     right_px: np.ndarray  # (V, N, 2) float64
-    seen: np.ndarray  # (V, N) where right_px holds
+    seen: np.ndarray  # (V, N) bool, where right_px is known
     K_left: np.ndarray  # (3, 3)
     K_rights: np.ndarray  # (V, 3, 3)
 
@@ -73,7 +73,7 @@ class Tracks:
         return self.alone(v).kept(self.seen[v])
 
     def seen_anywhere(self) -> Tracks:
-        """The tracks that one right view has at least."""
+        """The tracks that at least one right view sees."""
         return self.kept(np.any(self.seen, axis=0))
 
 
@@ -144,9 +144,9 @@ def solve_inverse_depth(tracks: Tracks, Ts: np.ndarray, weights: np.ndarray | No
 
 
 def residuals_px(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
-    """How far observations lie from where the poses ``(V, 4, 4)`` can put them; NaN where not seen.
+    """Reprojection error of every observation under poses ``Ts (V, 4, 4)``; NaN where not seen.
 
-    ``(V, N)`` pixels of the right views; with one right view that is the distance from the epipolar line.
+    ``(V, N)`` pixels of the right views; with one right view it is the distance from the epipolar line.
     """
     inverse_depth = solve_inverse_depth(tracks, Ts)
     off = [
@@ -178,11 +178,11 @@ def across_lines(tracks: Tracks, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def split_residuals(tracks: Tracks, T: np.ndarray) -> tuple[float, float]:
-    """How much a match counts, (0, 1], and the standard deviation of what neighbours share, pixels.
+    """Weight of a match, (0, 1], and standard deviation of the error that neighbours share, pixels.
 
-    Residuals are alike where no pose explains them (a rolling shutter, lens distortion, K); then many matches
-    hold a pose no better than a few. It shows in blocks of the image, whose means of ``n`` independent
-    residuals vary by ``1 / n`` of what one does. ``T (4, 4)`` fits the tracks, of one right view.
+    Errors that no pose explains (rolling shutter, lens distortion, K) are shared by neighbours; then many
+    matches determine a pose no better than a few. The means of blocks of the image show them: the mean of
+    ``n`` independent residuals has ``1 / n`` of their variance. ``T (4, 4)`` fits tracks of one right view.
     """
     off, _ = across_lines(tracks, T)
     scale = max(1.4826 * float(np.median(np.abs(off))), 1e-3)
@@ -227,7 +227,7 @@ def _grey(image_01: Tensor, K_image: Tensor, factor: float) -> tuple[np.ndarray,
 
 
 def grey_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> GreyViews:
-    """Images as matches are sought in them, of ``left_01 (3, H, W)`` in [0, 1] with its ``K_left (3, 3)``."""
+    """The images on the grid of the matches; ``left_01 (3, H, W)`` in [0, 1] has ``K_left (3, 3)``."""
     left, K = _grey(left_01, K_left, min(1.0, LONG_SIDE / max(left_01.shape[-2:])))
     small = []
     for image, K_right, _ in rights:
@@ -295,7 +295,7 @@ def _read(field: np.ndarray, px: np.ndarray) -> np.ndarray:
 def _dense_matches(
     left: np.ndarray, right: np.ndarray, uv: np.ndarray, visible: np.ndarray, centres: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Right pixels ``(N, 2)`` of cell centres, which ``uv`` predicts, and which of them hold."""
+    """Right pixels ``(N, 2)`` of cell centres, predicted by ``uv``, and which of them pass the checks."""
     warped = cv2.remap(right, uv, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     there, back = _flow(left, warped), _flow(warped, left)
     flow = _read(there, centres)

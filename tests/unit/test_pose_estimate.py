@@ -11,7 +11,14 @@ from PIL import Image
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.pose.estimate import estimate_pose, find_scale
-from geodiff_plugin.pose.solve import MOST_SPREAD, SCALE_PX, Prior, depth_spread, open_pose, solve_poses
+from geodiff_plugin.pose.solve import (
+    MOST_SPREAD,
+    SCALE_PX,
+    PosePrior,
+    depth_spread,
+    solve_poses,
+    undetermined_pose,
+)
 from geodiff_plugin.pose.tracks import Tracks, solve_inverse_depth
 from tests.scenes import render_pair
 from tests.unit.test_pose_refine import TRUE, K, angle_deg, make_tracks, pose
@@ -126,7 +133,8 @@ def test_without_a_length_there_is_no_unit_and_without_K_no_pose(pair) -> None:
     guidance = GeometryGuidance.from_photographs(*photographs, fov=fov)
     assert guidance.unit is None and np.linalg.norm(guidance.rigs[0].E[:3, 3]) == pytest.approx(1.0)
     assert any("no unit" in sentence for sentence in guidance.estimated.warnings)
-    assert open_pose(MOST_SPREAD) == () and "leave the estimated pose open" in open_pose(1.1 * MOST_SPREAD)[0]
+    assert undetermined_pose(MOST_SPREAD) == ()
+    assert "leave the estimated pose open" in undetermined_pose(1.1 * MOST_SPREAD)[0]
     with pytest.raises(ValueError, match="field of view"):
         GeometryGuidance.from_photographs(*photographs, baseline_m=0.1)
 
@@ -136,7 +144,7 @@ THIRD = pose((2.0, 5.0, -1.0), (-0.25, 0.1, 0.05))
 
 def fitted(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
     """Poses that nothing but the matches holds, the first baseline as long as it was."""
-    free = Prior(np.full(len(Ts), 1e3), turned_rad=1.0, shifted_share=10.0, longer_share=1.0)
+    free = PosePrior(np.full(len(Ts), 1e3), turned_rad=1.0, shifted_share=10.0, longer_share=1.0)
     solved = solve_poses(tracks, Ts, free, scale_px=SCALE_PX)
     solved[:, :3, 3] *= np.linalg.norm(Ts[0, :3, 3]) / np.linalg.norm(solved[0, :3, 3])
     return solved

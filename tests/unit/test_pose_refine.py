@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
 from geodiff_plugin.pose.refine import fit_displacement, refine_views, straightened, undecided
-from geodiff_plugin.pose.solve import Prior, is_rig, settle_poses, solve_poses
+from geodiff_plugin.pose.solve import PosePrior, is_rig, settle_poses, solve_poses
 from geodiff_plugin.pose.tracks import (
     Tracks,
     median_residuals,
@@ -82,13 +82,13 @@ def test_a_perturbed_pose_comes_back_but_for_what_the_views_cannot_tell() -> Non
     tracks, Ts, depth_m = make_tracks([TRUE])
     wrong = TRUE @ pose((0.7, -0.8, 0.5), (0, 0, 0))
     wrong[:3, 3] += np.cross(wrong[:3, 3], (0.5, 0.9, -0.4)) * 0.05  # across the baseline: its length stays
-    given, prior = np.linalg.inv(wrong)[None], Prior(np.array([10.0]))
+    given, prior = np.linalg.inv(wrong)[None], PosePrior(np.array([10.0]))
     solved = solve_poses(tracks, given, prior, start=solve_poses(tracks, given, prior, scale_px=8.0))
     assert angle_deg(solved[0, :3, :3] @ Ts[0, :3, :3].T) < 0.1
     assert depth_error(tracks, solved, depth_m) < 0.03 < depth_error(tracks, given, depth_m)
     longer = TRUE.copy()
     longer[:3, 3] *= 1.2
-    solved = np.linalg.inv(solve_poses(tracks, np.linalg.inv(longer)[None], Prior(np.array([0.5])))[0])
+    solved = np.linalg.inv(solve_poses(tracks, np.linalg.inv(longer)[None], PosePrior(np.array([0.5])))[0])
     assert np.linalg.norm(solved[:3, 3]) == pytest.approx(np.linalg.norm(longer[:3, 3]), rel=0.01)
 
 
@@ -115,7 +115,7 @@ def test_the_refinement_is_joint_and_reaches_the_optimum() -> None:
     poses = [TRUE, pose((-2.0, 5.0, 0.0), (-0.3, 0.1, 0.05))]
     tracks, _, _ = make_tracks(poses, noise_px=0.4, count=40, outliers=0.0)
     given = np.stack([np.linalg.inv(E @ pose((0.3, -0.4, 0.2), (0, 0, 0))) for E in poses])
-    loose = Prior(np.full(2, 1e4), 1e3, 1e3, 1e3)
+    loose = PosePrior(np.full(2, 1e4), 1e3, 1e3, 1e3)
     solved = solve_poses(tracks, given, loose, scale_px=1e3)
 
     def offs(x: np.ndarray) -> np.ndarray:
