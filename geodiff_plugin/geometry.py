@@ -1,7 +1,7 @@
 """Two pinhole cameras: intrinsics, projection, backward warping, what is hidden (S3.3, S7.2).
 
-Rigid transforms are kornia's (``kornia.geometry.linalg``). Where kornia has something else of it as well, a
-comment says why ours is used.
+Rigid transforms are kornia's (``kornia.geometry.linalg``). Where another function of kornia is similar, a
+comment says why it is not used.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ def resize_image(image_01: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Te
 
 
 def as_fine_as(image_01: Tensor, K: Tensor, K_left: Tensor) -> tuple[Tensor, Tensor]:
-    """A further image ``(C, H, W)`` at no more pixels per radian than the left one, and the K of it.
+    """A further image ``(C, H, W)`` at no more pixels per radian than the left one, and its K.
 
-    Neither then aliases in the other. Axis by axis: whole pixels round each differently, and a rectified pair
-    must stay one.
+    Then neither image aliases in the other. Each axis has its own factor: rounding to whole pixels changes
+    them differently, and a rectified pair must stay rectified.
     """
     height, width = image_size(image_01)
     rows, columns = (min(1.0, float(K_left[i, i] / K[i, i])) for i in (1, 0))
@@ -70,7 +70,7 @@ def as_fine_as(image_01: Tensor, K: Tensor, K_left: Tensor) -> tuple[Tensor, Ten
 
 
 def is_rectified(K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> Tensor:
-    """Whether disparity along rows says everything, ``(...)`` bool, of ``(..., 3, 3)`` and ``(..., 4, 4)``.
+    """Whether points differ along rows only, ``(...)`` bool, for ``(..., 3, 3)`` and ``(..., 4, 4)``.
 
     The rotation is the identity to 1e-3 an entry, ``|t_y|`` and ``|t_z|`` are below 1 % of ``|t_x|``, f
     agrees to 0.1 %, skew and cy to 0.1 % of f; cx may differ. Both K have as many pixels per radian.
@@ -94,13 +94,13 @@ class PlaneRays(NamedTuple):
     b: Tensor
 
 
-def made_there(like: Tensor, *values: float) -> Tensor:
-    """A small constant of ``like``'s dtype, made on its device: a list would be copied there, every time."""
+def constant_like(like: Tensor, *values: float) -> Tensor:
+    """A vector of ``like``'s dtype made on its device: a list would be copied to the device at every call."""
     return torch.stack([like.new_full((), value) for value in values])
 
 
 def unproject(depth_m: Tensor, K: Tensor) -> Tensor:
-    """Points ``(B, H, W, 3)`` metres of a depth map ``(B, 1, H, W)`` in its camera's frame; a skew is obeyed.
+    """Points ``(B, H, W, 3)`` metres of a depth map ``(B, 1, H, W)`` in its camera's frame, with skew.
 
     Convention:
         The pixel at the principal point has ``x = y = 0``; one focal length to its right has ``x = z``.
@@ -111,7 +111,7 @@ def unproject(depth_m: Tensor, K: Tensor) -> Tensor:
 def _rays(size: tuple[int, int], K: Tensor) -> Tensor:
     """Points at z = 1 behind every pixel, ``(B, H, W, 3)``."""
     rays = unproject_meshgrid(*size, K, device=K.device, dtype=K.dtype)
-    slant = (K[:, 0, 1] / K[:, 0, 0])[:, None, None]  # kornia's know no skew
+    slant = (K[:, 0, 1] / K[:, 0, 0])[:, None, None]  # kornia's rays have no skew
     return torch.cat([rays[..., :1] - (slant * rays[..., 1])[..., None], rays[..., 1:]], dim=-1)
 
 
@@ -126,12 +126,11 @@ def _in_front(z: Tensor) -> tuple[Tensor, Tensor]:
     return in_front, torch.where(in_front, z, torch.ones_like(z))
 
 
-# kornia's ``project_points`` knows no skew, and mirrors points behind the camera into the image.
+# kornia's ``project_points`` has no skew, and mirrors points behind the camera into the image.
 def project(points: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels ``uv (B, H, W, 2)`` and ``z (B, H, W)`` metres of points ``(B, H, W, 3)`` in a camera's frame.
 
-    At or behind the camera (``z <= NEAREST_M``) ``uv`` is a finite place outside of any image, with zero
-    gradient.
+    At or behind the camera (``z <= NEAREST_M``) ``uv`` is finite, outside of any image, without gradient.
     """
     z = points[..., 2]
     in_front, z_safe = _in_front(z)
@@ -144,10 +143,9 @@ def project(points: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
 def plane_rays(
     K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor, size: tuple[int, int]
 ) -> PlaneRays:
-    """Everything of the projection from a left grid ``(H, W)`` to the right image that does not need depth.
+    """The part of the projection from a left grid ``(H, W)`` to the right image that does not need depth.
 
-    The pixel with depth z has the homogeneous right pixel ``z * A + b``, whose third component is its depth
-    there.
+    A pixel of depth z has the homogeneous right pixel ``z * A + b``, whose third component is depth there.
 
     Source: Eq. 25 (eq:forward-warp_supp), with the products of matrices taken once.
     """
@@ -194,8 +192,8 @@ def sample_at(image: Tensor, uv: Tensor, *, mode: str = "bilinear") -> Tensor:
     """
     height, width = image.shape[-2:]
     # align_corners=True: -1 and 1 are the centres of the first and the last pixel, where uv counts from.
-    # Like kornia's ``remap``, whose places differ by up to 6e-5 px; and it sends points behind the camera on.
-    last = made_there(uv, max(width - 1, 1), max(height - 1, 1))
+    # kornia's ``remap`` differs by up to 6e-5 px, and does not clamp points behind the camera.
+    last = constant_like(uv, max(width - 1, 1), max(height - 1, 1))
     grid = (2.0 * uv / last - 1.0).clamp(-2.0, 2.0)
     return F.grid_sample(image, grid, mode=mode, padding_mode="border", align_corners=True)
 
@@ -219,10 +217,9 @@ def warp_right_to_left(
 ) -> Warped:
     """Re-render the left image from the right one by the left depth (bilinear backward warp).
 
-    As kornia's ``warp_frame_depth`` where that is defined: it takes one K, and does not say what is visible.
+    kornia's ``warp_frame_depth``, which gives the same, takes one K and does not return what is visible.
     ``right (B, C, Hr, Wr)`` is of any size, ``depth_m (B, 1, H, W)`` metres on the left grid; the image is
-    differentiable in both where visible. ``rays`` are ``plane_rays`` of these cameras, where they are used
-    again.
+    differentiable in both where visible. ``rays`` are ``plane_rays`` of these cameras, to be reused.
 
     Convention:
         A right camera ``b`` metres to the right (``T[0, 3] = -b``): the left pixel ``u`` with depth z reads
@@ -252,8 +249,7 @@ def hidden_in_right(
     """Left pixels that another part of the left surface hides from the right camera, ``(B, 1, H, W)`` bool.
 
     The surface is splatted into a depth buffer of the right view, of ``size_right (Hr, Wr)``; a pixel is
-    hidden where the buffer is nearer by more than the relative ``margin``, and never outside of the right
-    image.
+    hidden where the buffer is nearer by more than the relative ``margin``, never outside the right image.
     """
     batch, _, height, width = depth_m.shape
     if rays is None:
@@ -262,7 +258,7 @@ def hidden_in_right(
     seen = _inside(uv, z, size_right)[:, 0]  # (B, H, W)
     # No finer than the left grid, else the splatted surface has holes that show what is behind it.
     rows, columns = min(size_right[0], height), min(size_right[1], width)
-    scale = made_there(uv, columns / size_right[1], rows / size_right[0])
+    scale = constant_like(uv, columns / size_right[1], rows / size_right[0])
     cell = (uv + 0.5) * scale - 0.5
     far = torch.finfo(z.dtype).max
     z_seen = torch.where(seen, z, torch.full_like(z, far))
@@ -273,7 +269,7 @@ def hidden_in_right(
 
     buffer = z.new_full((batch, rows * columns), far)
     for step in ((0, 0), (1, 0), (0, 1), (1, 1)):  # every cell within 3/4 px: slopes leave no holes
-        target = cell.floor() + made_there(cell, *step)
+        target = cell.floor() + constant_like(cell, *step)
         near = ((target - cell).abs() <= 0.75).all(dim=-1)
         z_splat = torch.where(near, z_seen, torch.full_like(z, far))
         buffer.scatter_reduce_(1, index(target), z_splat.flatten(1), "amin")

@@ -71,14 +71,14 @@ class PoseReport:
     E: tuple[np.ndarray, ...]  # the same as used
     residual_px_given: tuple[float, ...] = ()  # median distance of the matches from their epipolar lines
     residual_px: tuple[float, ...] = ()  # the same with the poses, and images, as used
-    matches: tuple[float, ...] = ()  # their number, of each right view
+    matches: tuple[float, ...] = ()  # number of matches of each right view
     straightened_px: tuple[float, ...] = ()  # root mean square displacement of the right images; 0 for none
     scale_spread: float | None = None  # relative, of the scale of refined poses; None for measured baselines
     warnings: tuple[str, ...] = ()  # sentences for the user
 
 
 class CameraView(NamedTuple):
-    """An image ``(C, H, W)`` float32 in [0, 1] beside the left one, C = 3, or 1 for grey, and its camera.
+    """A right image ``(C, H, W)`` float32 in [0, 1], C = 3, or 1 for grey, and its camera.
 
     ``K (3, 3)`` is in pixels of this image; ``T_right_from_left (4, 4)``, metres, maps points of the left
     camera's frame to this one's.
@@ -142,7 +142,7 @@ class MetricDepthOutput(BaseOutput):
         scale_spread: relative spread of that scale over matches or the prior's map; ``None`` if unknown.
         rescaled: factor from the lengths of ``GeometryGuidance`` to metres, if only the prior knows the unit.
         warnings: sentences for the user about this result, and those that the guidance gave when it was made.
-        assumed: sentences on what nobody gave, such as the right camera's principal point.
+        assumed: sentences on assumed inputs, such as the right camera's principal point.
     """
 
     prediction: np.ndarray | torch.Tensor

@@ -1,4 +1,4 @@
-"""Fit a metric map to its matches and points: edge-aware least squares, as stiff as the prior is good."""
+"""Fit a metric map to its matches and points by edge-aware least squares, stiffer for a better prior."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import Matches, with_points
 from geodiff_plugin.scale.points import weighted_quantile
 
-#: Longer side in pixels of the grid that ``smoothness``, ``IMAGE_EDGE`` and ``DEPTH_EDGE`` are numbers of; on
-#: another one they are scaled, so that a correction reaches the same share of the image.
+#: Longer side in pixels of the grid for which ``smoothness``, ``IMAGE_EDGE`` and ``DEPTH_EDGE`` hold; on
+#: other grids they are scaled, so that a correction reaches the same share of the image.
 REFERENCE_SIDE = 512.0
-#: Error of the prior at which ``smoothness`` and ``INERTIA`` hold, and the power of it that both fall with.
+#: Error of the prior at which ``smoothness`` and ``INERTIA`` hold; both fall with this power of the error.
 REFERENCE_ERROR, STIFFNESS_POWER = 0.05, 4.0
-#: Bounds of the smoothness, however wrong or right the prior is.
+#: Bounds of the smoothness.
 LOOSEST, STIFFEST = 0.03, 100.0
-#: Weight of the correction itself, so that what is far from every match keeps its depth.
+#: Weight of the squared correction, so that pixels far from every match keep their depth.
 INERTIA = 0.015
-#: Its bounds in the last pass.
+#: Bounds of the inertia in the last pass.
 LEAST_INERTIA, MOST_INERTIA = 5e-4, 0.03
-#: Passes of a fit, in even ratios from a broad smoothness to the prior's own.
+#: Passes of a fit; the smoothness falls geometrically from a broad one to that of the prior's error.
 PASSES = 3
-#: Smoothness and least inertia of the first: it corrects whole regions, far from any match too.
+#: Smoothness and least inertia of the first pass: it corrects whole regions, even far from any match.
 BROAD_SMOOTHNESS, BROAD_INERTIA = 50.0, 1e-4
 #: Smoothness, and inertia as a share of it, of the fit that measures the prior and finds outliers.
 STIFF_SMOOTHNESS, STIFF_INERTIA = 400.0, 1.3e-3
@@ -44,13 +44,13 @@ LEAST_ERROR, MOST_ERROR = 0.01, 0.5
 IMAGE_EDGE, DEPTH_EDGE = 0.1, 0.1
 #: Share of the smoothness that remains across any edge.
 LEAST_LINK = 1e-3
-#: How far the window of a match reaches over an edge, as a share of the longer side, and which step in log
-#: depth is an edge.
+#: How far the window of a match reaches over an edge, as a share of the longer side; step in log depth
+#: that counts as an edge.
 EDGE_REACH, EDGE_STEP = 0.006, 0.3
-#: The step grows with the third power of an error of the prior above this: it does not know where edges are.
+#: Above this error of the prior, ``EDGE_STEP`` grows with its third power: its edges are in wrong places.
 EDGE_ERROR = 0.11
-#: Share of the right matches' residuals by which the prior is measured, and the normal distribution's
-#: quantile of their size there: the median would not see that a fifth of the scene is on a wrong surface.
+#: The prior's error is this quantile of the correct matches' residuals over the normal distribution's: the
+#: median would miss that a fifth of the scene is on a wrong surface.
 SHARE, NORMAL_QUANTILE = 0.8, 1.2816
 
 
@@ -59,7 +59,7 @@ class _Observations(NamedTuple):
 
     ``residual`` is the log of the factor on the map's inverse depth that a match asks for, ``noise`` its
     standard deviation, ``weight`` confidence over relative variance, ``right_share (B, 1)`` the share of the
-    weight that is expected to be right, ``links`` are across and down, of a smoothness of 1.
+    weight that correct matches are expected to have, ``links`` are across and down, at a smoothness of 1.
     """
 
     residual: Tensor
@@ -88,15 +88,15 @@ def _log_depth(depth_m: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _links(guide: Tensor, log_depth: Tensor, axis: int) -> Tensor:
-    """Strength with which neighbours along an axis share a correction, ``(B, 1, h, w)`` less one there."""
+    """Strength with which neighbours along an axis share a correction, one per pair of them."""
     scale = max(guide.shape[-2:]) / REFERENCE_SIDE
     step = guide.diff(dim=axis).abs().mean(1, keepdim=True) / IMAGE_EDGE
     jump = log_depth.diff(dim=axis).abs() / DEPTH_EDGE
     return scale**2 * torch.exp(-scale * (step + jump)).clamp_min(LEAST_LINK)
 
 
-def _times(links: tuple[Tensor, Tensor], smoothness: Tensor) -> tuple[Tensor, Tensor]:
-    """Links of the smoothness ``(B, 1, 1, 1)`` of every sample, or ``(B, 1, h, w)``, the lower of two."""
+def _scaled(links: tuple[Tensor, Tensor], smoothness: Tensor) -> tuple[Tensor, Tensor]:
+    """Links times a smoothness ``(B, 1, 1, 1)``, or ``(B, 1, h, w)``: the lower one of both ends."""
     if smoothness.shape[-2:] != (1, 1):
         across = torch.minimum(smoothness[..., 1:], smoothness[..., :-1])
         down = torch.minimum(smoothness[..., 1:, :], smoothness[..., :-1, :])
@@ -105,9 +105,9 @@ def _times(links: tuple[Tensor, Tensor], smoothness: Tensor) -> tuple[Tensor, Te
 
 
 def local_error(error: Tensor | None, valid: Tensor | None) -> Tensor | None:
-    """A prior's ``error (B, 1, 1, 1)`` where it says something, the largest elsewhere, ``(B, 1, H, W)``.
+    """A prior's ``error (B, 1, 1, 1)`` where it gives a depth, ``MOST_ERROR`` elsewhere, ``(B, 1, H, W)``.
 
-    ``valid (B, 1, H, W)`` is above 0 where the prior says something; ``None`` returns ``error`` itself.
+    ``valid (B, 1, H, W)`` is above 0 where the prior gives a depth; ``None`` returns ``error`` itself.
     """
     if error is None or valid is None:
         return error
@@ -115,7 +115,7 @@ def local_error(error: Tensor | None, valid: Tensor | None) -> Tensor | None:
 
 
 def _on_grid(error: Tensor, size: tuple[int, int]) -> Tensor:
-    """A ``local_error`` on another grid; a single number per sample stays as it is."""
+    """A ``local_error`` on another grid; one number per sample is returned unchanged."""
     if image_size(error) in ((1, 1), size):
         return error
     return F.interpolate(error, size, mode="nearest-exact")
@@ -128,11 +128,10 @@ def correction_target(
     error: Tensor | None,
     depth_m: Tensor,
 ) -> Matches | None:
-    """What an estimate is fitted to: matches, but for reflections and those beside its edges, and points.
+    """What an estimate is fitted to: points, and matches that are no reflections and not beside its edges.
 
-    ``matches`` and ``points`` are on one grid; ``kept`` is the share of each match's confidence that remains
-    without reflections (before it is known no match is used), ``error`` of the prior, before it is measured
-    ``None``.
+    ``matches`` and ``points`` are on one grid; ``kept`` is the factor on each match's confidence that removes
+    reflections (``None``: no match is used yet), ``error`` that of the prior, ``None`` until it is measured.
     """
     if matches is None or kept is None:
         return None if points is None else with_points(None, points)
@@ -146,11 +145,11 @@ def correction_target(
 
 @torch.no_grad()
 def off_edges(target: Matches, depth_m: Tensor, error: Tensor) -> Matches:
-    """Matches with less confidence near the depth edges of a map, as far as the map knows where they are.
+    """Matches with less confidence near the depth edges of a map.
 
-    A window of the matching that lies across an edge takes the nearer surface's depth for both. Known points
-    are measured on their own ray and do not belong here. A prior whose ``error`` is above ``EDGE_ERROR`` has
-    its edges elsewhere than the scene.
+    A matching window across an edge gives both sides the depth of the nearer surface. Known points have no
+    window and do not belong here. A prior whose ``error`` is above ``EDGE_ERROR`` has its edges in wrong
+    places, so matches lose less.
     """
     size = target.size
     log_depth = _log_depth(depth_m, size)
@@ -167,7 +166,7 @@ def _highest(values: Tensor, reach: int) -> Tensor:
 
 
 def _robust(residual: Tensor, noise: Tensor, error: Tensor, config: GuidanceConfig) -> Tensor:
-    """Cauchy weight of residuals that a prior of this error leaves beside the noise of a match."""
+    """Cauchy weight of residuals whose variance is that of the match plus that of the prior."""
     return 1.0 / (1.0 + residual**2 / (config.outlier_width**2 * (noise**2 + error**2)))
 
 
@@ -180,14 +179,20 @@ def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: Guid
 
     rounds, inertia = REWEIGHTINGS + 1, STIFF_INERTIA * stiff
     return solve_robust(
-        _times(observed.links, stiff), observed.residual, inertia, trusted, robust, rounds, SOLVER_STEPS
+        _scaled(observed.links, stiff),
+        observed.residual,
+        inertia,
+        trusted,
+        robust,
+        rounds,
+        SOLVER_STEPS,
     )[0]
 
 
 def _spread(residual: Tensor, observed: _Observations) -> Tensor:
-    """``(B, 1, 1, 1)`` robust standard deviation of residuals beyond the noise of their matches.
+    """``(B, 1, 1, 1)`` robust standard deviation of residuals, less the noise of their matches.
 
-    As many matches as are expected to be wrong, those with the largest residuals, are left out.
+    The largest residuals are left out, as many as matches are expected to be wrong.
     """
     weight = observed.weight.flatten(1)
     largest = weighted_quantile(residual.abs().flatten(1), weight, SHARE * observed.right_share)
@@ -200,11 +205,11 @@ def _spread(residual: Tensor, observed: _Observations) -> Tensor:
 def prior_error(
     depth_m: Tensor, target: Matches, left_01: Tensor, config: GuidanceConfig = DEFAULT
 ) -> Tensor:
-    """How far a prior is wrong, in log depth, ``(B, 1, 1, 1)`` within ``LEAST_ERROR`` and ``MOST_ERROR``.
+    """Error of a prior in log depth, ``(B, 1, 1, 1)`` within ``LEAST_ERROR`` and ``MOST_ERROR``.
 
-    Matches are left out in blocks, and predicted from those of the other blocks by the prior's map under a
-    stiff correction: what the map itself is worth between matches, not how well it can be bent to them.
-    Arguments as ``refine_depth``, of a map that no match has moved yet but for scale and shift.
+    Cross-validation: matches are left out in blocks and predicted from the other blocks by the prior's map
+    under a stiff correction. This measures the map between matches, not how well it can be bent to them.
+    Arguments as ``refine_depth``, for a map that matches have moved in scale and shift only.
     """
     observed = _observations(depth_m, target, left_01, config)
     height, width = observed.residual.shape[-2:]
@@ -228,23 +233,21 @@ def refine_depth(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Least-squares correction of log depth that follows matches and stops at edges.
 
-    With ``u`` the correction and ``r`` what each match asks of it, less the result of earlier passes, a pass
-    is the minimiser of ``sum w (u - r)^2 + a sum g |grad u|^2 + b sum u^2``: ``w`` is the confidence over the
+    With ``u`` the correction and ``r`` the residual of each match after earlier passes, a pass is the
+    minimiser of ``sum w (u - r)^2 + a sum g |grad u|^2 + b sum u^2``: ``w`` is the confidence over the
     match's relative variance, robustly reweighted, and ``g`` falls at edges of the image and of the given
-    depth. Passes go from a broad ``a`` to that of the prior's error: a pixel that no match is near keeps what
-    the broad passes say of its region. The number of solves is fixed, so that no device is waited for.
+    depth. Passes go from a broad ``a`` to that of the prior's error: a pixel far from matches keeps the
+    correction that the broad passes gave its region. The number of solves is fixed, so no GPU is waited for.
 
     Args:
         depth_m: ``(B, 1, H, W)`` metres, at any resolution.
         target: matches or known points of the same images, on any grid.
         left_01: ``(B, 3, h, w)`` in [0, 1], the left images at any resolution.
-        error: of the prior, as ``prior_error`` or ``local_error`` gives it: matches that contradict a good
-            one count for less.
+        error: ``prior_error`` or ``local_error``; matches that contradict a good prior count for less.
         config: the fit's numbers.
 
     Returns:
-        The fitted depth; its support in [0, 1], how far matches decided it; and ``u`` on the grid of the
-        matches.
+        The fitted depth; its support in [0, 1], how far matches determine it; ``u`` on their grid.
     """
     observed = _observations(depth_m, target, left_01, config)
     error = _on_grid(error, target.size)
@@ -261,7 +264,7 @@ def refine_depth(
         data = observed.residual - total
         if k == len(levels) - 1:  # a second right-hand side of ones shows where the correction is decided
             data = torch.cat([data, torch.ones_like(data)], 1)
-        links = _times(observed.links, smoothness)
+        links = _scaled(observed.links, smoothness)
         part, weights = solve_robust(links, data, inertia, weights, robust, REWEIGHTINGS, SOLVER_STEPS)
         total, decided = total + part[:, :1], part[:, 1:]
     size = image_size(depth_m)
@@ -274,7 +277,7 @@ def refine_depth(
 
 
 def _levels(error: Tensor, config: GuidanceConfig) -> list[tuple[Tensor, Tensor]]:
-    """Smoothness and inertia ``(B, 1, 1, 1)`` of every pass, from broad to the prior's own."""
+    """Smoothness and inertia ``(B, 1, 1, 1)`` of every pass, from broad to that of the prior's error."""
     ratio = REFERENCE_ERROR / error
     last = (config.smoothness * ratio**STIFFNESS_POWER).clamp(LOOSEST, STIFFEST)
     broad = last.clamp_min(BROAD_SMOOTHNESS)

@@ -20,7 +20,7 @@ PREDICTION_TYPES = ("epsilon", "sample", "v_prediction", "flow_prediction")
 class NoiseLevel:
     """``z_t = alpha z_0 + sigma eps`` at one timestep; both 0-d float32, in [0, 1] and (0, 1].
 
-    The scheduler clamps ``z0_hat`` to ``[-clip, clip]``, with ``None`` not at all.
+    The scheduler clamps ``z0_hat`` to ``[-clip, clip]``, unless ``clip`` is ``None``.
     """
 
     alpha: Tensor
@@ -64,8 +64,8 @@ def noise_from(output: Tensor, z_t: Tensor, level: NoiseLevel) -> Tensor:
 def output_from(z0: Tensor, eps: Tensor, level: NoiseLevel) -> tuple[Tensor, Tensor]:
     """The network output and noisy latent whose clean latent is ``z0`` and whose noise is ``eps``.
 
-    Given both, the scheduler's ``step`` moves the clean latent in any scheduler, multistep and stochastic
-    ones included, without a second formula for z_{t-1}.
+    Given these two, the ``step`` of any scheduler, multistep and stochastic ones included, continues from the
+    moved clean latent, without a second formula for z_{t-1}.
     """
     z_t = level.alpha * z0 + level.sigma * eps
     if level.prediction_type == "epsilon":

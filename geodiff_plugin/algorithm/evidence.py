@@ -1,7 +1,7 @@
-"""What the views and points say of one left image, once a call; and the views of a chunk of samples.
+"""``Evidence``: cost volume, matches and points of a left image, made once a call; views of a chunk.
 
-All of it lies on one grid, ``sweep_pixels`` large: matches, corrections and losses. The result is made at the
-image's own size from there.
+Matches, corrections and losses lie on one grid of at most ``sweep_pixels``; the result is brought to the
+image's size afterwards.
 Source: S7.3 (the plane-sweep view of the g_s search); the matches are beyond it.
 """
 
@@ -19,8 +19,8 @@ from geodiff_plugin.matching import (
     CostVolume,
     Matches,
     build_cost_volume,
+    inverse_pose_preferred,
     match_volume,
-    mirrored_pose_preferred,
     points_to_matches,
     to_grid,
 )
@@ -31,7 +31,7 @@ from geodiff_plugin.types import CameraView, PoseReport
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the views and points say before any diffusion step, on the grid of the evidence."""
+    """What the views and points tell about depth before any diffusion step, on the grid of the evidence."""
 
     left_01: Tensor  # (3, H, W) in [0, 1]
     native_left: Tensor  # the same at its native size
@@ -41,13 +41,13 @@ class Evidence:
     matches: Matches | None  # aggregated, left-right checked, where a term asks
     points: Matches | None = None  # depths that the user knows, in the form of matches
     reliable: Matches | None = None  # ``matches`` as points for the search, where enough are reliable
-    native_views: tuple[CameraView, ...] = ()  # as everything downstream sees them, at their native sizes
+    native_views: tuple[CameraView, ...] = ()  # cleaned, with the poses in use, at their native sizes
     pose: PoseReport | None = None  # how their poses fit
     warnings: tuple[str, ...] = ()  # sentences for the user
 
 
 def within(evidence: Evidence, valid: Tensor) -> Evidence:
-    """Evidence with confidence 0 where the prior is not ``valid``, on any grid; or all of its points."""
+    """Evidence with confidence 0 where the prior is not ``valid``, on any grid; points stay if none is."""
     matches, points = (m and m.within(valid) for m in (evidence.matches, evidence.points))
     if points is not None and not bool(points.confidence.any()):
         points = evidence.points
@@ -66,40 +66,40 @@ def prepare_evidence(
 ) -> Evidence:
     """Cost volume, matches and points of one image; left image, views and ``K_left`` are native.
 
-    ``needs_matches``: the volume is aggregated and checked against each view. ``pose`` tells how the poses of
-    the views came about.
+    ``needs_matches``: the volume is aggregated and checked against each view. ``pose`` reports how the poses
+    fit and whether they were refined.
     """
     left, further, K = to_grid(left_01, views, K_left, config.sweep_pixels)
-    volume, matches, targets = None, None, None
+    volume, matches, known_points = None, None, None
     warnings: list[str] = [] if pose is None else list(pose.warnings)
     if views and (config.search == "volume" or needs_matches):
         volume = build_cost_volume(left_01, views, K_left, depth_range=config.depth_range, config=config)
         if needs_matches:
             matches = match_volume(volume)
-        if mirrored_pose_preferred(left_01, views, K_left, matches):
+        if inverse_pose_preferred(left_01, views, K_left, matches):
             warnings.append(INVERSE)
     if points is not None:
-        targets, left_out = points_to_matches(points, K_left, image_size(left_01), image_size(left))
+        known_points, left_out = points_to_matches(points, K_left, image_size(left_01), image_size(left))
         if left_out:
             warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
     reliable = None if matches is None else reliable_matches(matches)
     # Read back from the device now, so that no step waits for it.
     if volume is not None:
         _ = volume.reach_m, volume.rectified
-    for target in (matches, targets, reliable):
+    for target in (matches, known_points, reliable):
         if target is not None:
             _ = target.above(0.0), target.above(RELIABLE)
-    told = tuple(dict.fromkeys(warnings))  # the same mistake may show in two ways
-    known = volume, matches, targets, reliable
-    return Evidence(left, left_01, K, further, *known, tuple(views), pose, told)
+    distinct = tuple(dict.fromkeys(warnings))  # two checks may find the same mistake
+    depths = volume, matches, known_points, reliable
+    return Evidence(left, left_01, K, further, *depths, tuple(views), pose, distinct)
 
 
 @dataclass(frozen=True)
 class Views:
-    """What the cameras saw of every sample of a chunk, on the grid of the evidence.
+    """Images and cameras of every sample of a chunk, on the grid of the evidence.
 
-    ``left_01 (B, 3, H, W)``, ``K_left (B, 3, 3)``; ``further`` views have a batch axis on each of their
-    tensors, as many for every sample; ``rays`` are each of these cameras and the left one, made once a chunk.
+    ``left_01 (B, 3, H, W)``, ``K_left (B, 3, 3)``; ``further`` are the right views, with a batch
+    axis on each tensor, as many for every sample; ``rays`` are those of each, made once a chunk.
     """
 
     left_01: Tensor
@@ -116,8 +116,8 @@ class Views:
 def chunk_views(evidence: Sequence[Evidence]) -> Views:
     """Stack the views of a chunk of samples, one entry each, images and K of one size.
 
-    An image with fewer views than another repeats its first: the terms take the best view of each pixel,
-    which a repetition does not change.
+    An image with fewer views than another repeats its first one: the terms take the best view of each pixel,
+    so repetition changes nothing.
     """
     left = torch.stack([image.left_01 for image in evidence])
     K_left = torch.stack([image.K_left for image in evidence])

@@ -1,4 +1,4 @@
-"""The last stage: depth edges of the result follow the prior, the matches and the image's colours.
+"""The last stage: place the depth edges of the result by prior, matches and colours of the image.
 
 Beyond the paper, whose result is the decoded latent. Ramps between two surfaces are made steep, the map is
 fitted to its matches (``correction.refine_depth``), and the matches around every pixel vote on its depth.
@@ -30,7 +30,7 @@ HALF = 2
 #: Difference in brightness at which a neighbour's weight falls to a third; a Gaussian over the window, in
 #: samples, does the rest.
 BRIGHTNESS, REACH = 0.1, 1.5
-#: Where the surfaces beside a ramp are looked for, in pixels of the prior's grid.
+#: Distance from a ramp to the surfaces beside it, in pixels of the prior's grid.
 BESIDE = 3
 #: The least relative step in inverse depth from a pixel on a ramp to each of two opposite neighbours.
 STEP = 0.02
@@ -42,24 +42,24 @@ SLOPE = 0.04
 RAMP_BRIGHTNESS = 0.12
 #: Two opposite neighbours: across, down, and both diagonals.
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
-#: Pixels on ramps whose windows are in memory at once; pixels of a strip whose votes stay in a CPU's cache.
+#: Pixels on ramps whose windows are in memory at once; pixels per strip of the votes, for a CPU's cache.
 CHUNK, STRIP = 1 << 16, 1 << 13
-#: Pixels of the grid of the votes at most: a larger picture takes its depth from there, by its colours.
+#: Upper bound on the pixels of the voting grid; larger pictures upsample its depth, guided by colour.
 MOST_PIXELS = 600_000
-#: Offsets of the voters in samples, every second of a window, and their distance in pixels.
+#: Offsets of the voters in samples (every second one of the window); pixels between samples.
 WINDOW = [(v, u) for v in range(-HALF, HALF + 1) for u in range(-HALF, HALF + 1) if (v + u) % 2 == 0]
 SPACING = 4
-#: Weight of a match of rows, and of the farther surface beside a gap, against a sure match of the sweep.
+#: Weight of a row match, and of a gap filled from the farther surface, relative to a sure sweep match.
 ROWS, FILLED = 1.5, 0.5
 #: Vote of the map itself, as a share of a window full of sure matches, for a prior whose measured error is
 #: ``WEAK_PRIOR`` or more. It grows as the cube of a smaller one: a good prior knows where edges are.
 MAP_VOTE, WEAK_PRIOR = 0.03, 0.2
-#: A match counts for a quarter where it differs from the map by this many errors of the prior; a larger error
-#: than the second number counts as that.
+#: A match that differs from the map by this many errors of the prior counts for a quarter; the error used
+#: here is at most the second number.
 DIFFERS, ERROR_OF_VOTES = 2.0, 0.1
 #: Votes within about this many pixels of the median make the mean.
 NEAR_PX = 1.0
-#: Side of the last median, over pixels of the grid of the votes.
+#: Side of the last median filter, pixels of the voting grid.
 MEDIAN = 5
 
 
@@ -69,9 +69,9 @@ def sharpen_edges(depth_m: Tensor, left_01: Tensor, spacing: int = 1) -> Tensor:
 
     A pixel is on a ramp if its inverse depth lies between those of two opposite neighbours, with a step to
     each, and the ramp is steeper than the surfaces at its ends. A plane, however oblique, has the same slope
-    everywhere in inverse depth, and is none. The new depth is the median over a window, in which neighbours
-    on the ramp, of another look or far away count for less. ``depth_m (B, 1, H, W)`` and ``left_01`` lie on
-    one grid, ``spacing`` pixels of it are one of the grid that the map was decoded on.
+    everywhere in inverse depth, so it is no ramp. The new depth is a median over a window; neighbours on
+    the ramp, of another colour or far away count for less. ``depth_m (B, 1, H, W)`` and ``left_01`` lie on
+    one grid; ``spacing`` is its pixels per pixel of the grid that the map was decoded on.
     """
     height, width = image_size(depth_m)
     halo = (BESIDE + 1) * spacing
@@ -107,7 +107,7 @@ class _Strip:
         return self.inverse[top : top + height, first : first + width]
 
     def on_ramp(self) -> Tensor:
-        """``(h, w)`` whether a pixel hangs between two surfaces."""
+        """``(h, w)`` bool: pixels whose depth lies between that of two surfaces."""
         centre = self._along((0, 0), 0)
         on_ramp = torch.zeros_like(centre, dtype=torch.bool)
         for way in DIRECTIONS:
@@ -149,13 +149,13 @@ def vote_depth(
     target: Matches,
     error: Tensor,
 ) -> Tensor:
-    """Give every pixel the depth that matches around it of the same colour, and the map, vote for.
+    """Give every pixel the depth voted by the map and by the matches around it that have its colour.
 
     The weighted median of the votes chooses a surface; the mean of those near it is the depth. Rows of a
-    rectified view are matched again at this resolution, which sees edges that the sweep's grid does not;
-    without such a view the map stays. ``depth_m (1, 1, H, W)`` is fitted to the matches; left image, K and
-    views are native; the prior's ``error (1, 1, 1, 1)`` decides how much contradicting matches count, and its
-    own vote. The result stays within the range of ``depth_m``.
+    rectified view are matched again at this resolution, for edges that the sweep's grid cannot resolve;
+    without a rectified view the map is returned unchanged. ``depth_m (1, 1, H, W)`` is fitted to the matches;
+    left image, K and views are native; the prior's ``error (1, 1, 1, 1)`` decides how much contradicting
+    matches, and the map itself, count. The result stays within the range of ``depth_m``.
     """
     native = image_size(left_01)
     rectified = [v for v in views if is_rectified(K_left, v.K, v.T_right_from_left)]
@@ -186,7 +186,7 @@ def vote_depth(
     )
     map_vote = MAP_VOTE * (WEAK_PRIOR / error).clamp_min(1.0) ** 3
     voted = _vote_in_windows(votes, left[0], shift, map_vote)
-    # Without ragged borders; a map that outvotes a window full of matches has none, and a known point stays.
+    # The median smooths ragged borders; a map that outvotes its matches has none, and known points stay.
     smooth = torch.from_numpy(cv2.medianBlur(np.ascontiguousarray(voted.cpu().numpy()), MEDIAN))
     voted = torch.where((map_vote < 1.0) & (confidence <= 1.0), smooth.to(voted.device), voted)
     if size != full:
@@ -203,7 +203,7 @@ def _resized(image_01: Tensor, size: tuple[int, int]) -> Tensor:
 
 def _weigh_votes(votes: Tensor, weight: Tensor, shift: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
     """Votes ``(H, W)`` and their weights, lower where they differ from the map by more than the error."""
-    noise = error.clamp_max(ERROR_OF_VOTES) ** 2 + 1.0 / shift**2  # of the map, and of a match: a pixel
+    noise = error.clamp_max(ERROR_OF_VOTES) ** 2 + 1.0 / shift**2  # of the map, and of a match (1 px)
     apart = (votes.clamp_min(0.1) / shift).log() ** 2 / (DIFFERS**2 * noise)
     return votes, weight / (1.0 + apart) ** 2
 
@@ -211,14 +211,14 @@ def _weigh_votes(votes: Tensor, weight: Tensor, shift: Tensor, error: Tensor) ->
 def weighted_median(values: Tensor, weight: Tensor, rounds: int = 7) -> Tensor:
     """Weighted median over the first axis, to within ``2**-rounds`` of the values' range, by bisection.
 
-    Where no value has weight, about the least.
+    Where all weights are 0, about the least value.
     """
     low, high, half = values.amin(0), values.amax(0), weight.sum(0) / 2.0
-    room = torch.empty_like(weight)
+    counted = torch.empty_like(weight)
     for _ in range(rounds):
         middle = 0.5 * (low + high)
-        torch.le(values, middle, out=room)  # in place: ten times as fast as a choice of two
-        reached = room.mul_(weight).sum(0) >= half
+        torch.le(values, middle, out=counted)  # in place, ten times as fast as torch.where
+        reached = counted.mul_(weight).sum(0) >= half
         high, low = torch.where(reached, middle, high), torch.where(reached, low, middle)
     return 0.5 * (low + high)
 
@@ -265,7 +265,7 @@ def _mean_near_median(votes: Tensor, weights: Tensor) -> Tensor:
 
 
 def _enlarged(voted: Tensor, left: Tensor, whole: Tensor) -> Tensor:
-    """``(H, W)`` votes at the size of ``whole (3, H, W)``, from the nine around that look like the pixel."""
+    """``(H, W)`` votes at the size of ``whole (3, H, W)``, from the 9 nearest ones of similar colour."""
     (height, width), (rows, columns) = image_size(whole), image_size(left)
     out = voted.new_empty(height, width)
     x = (torch.arange(width, device=voted.device, dtype=voted.dtype) + 0.5) * (columns / width) - 0.5

@@ -1,4 +1,4 @@
-"""Gradients: pulled back through networks of half precision, checked to be finite, and turned into steps.
+"""Pull gradients back through networks of half precision, check that they are finite, make steps of them.
 
 Source: Algorithm 1 (plain step), Eq. 15 (eq:final_score), S5.1 (learning rate 1e-2, no optimiser).
 """
@@ -18,9 +18,8 @@ from geodiff_plugin._checks import bad_value
 def pull_back(output: Tensor, source: Tensor, gradient: Tensor) -> Tensor:
     """The gradient in ``source`` of a loss whose gradient in ``output`` is given; frees the graph between.
 
-    Inside the graph the largest entry of every sample is between 1/2 and 1: a gradient in one pixel of a mean
-    may be below float16's least number, or above its greatest if a constant lifted it. The factor is a power
-    of two, so in float32 the result is what it would be without it.
+    Each sample's gradient is first scaled so that its largest entry is between 1/2 and 1: otherwise it could
+    under- or overflow in float16. The factor is a power of two, so in float32 it changes nothing.
     """
     largest = gradient.detach().abs().flatten(1).amax(1)
     unit = torch.ldexp(torch.ones_like(largest), torch.frexp(largest).exponent)
@@ -30,14 +29,14 @@ def pull_back(output: Tensor, source: Tensor, gradient: Tensor) -> Tensor:
 
 
 class FiniteWatch:
-    """Records, on their device, which tensors of a trajectory were finite; checked once at the end."""
+    """Records on the device which tensors of a trajectory are finite; ``check`` reads them at the end."""
 
     def __init__(self) -> None:
         self._names: list[tuple[str, int]] = []
         self._finite: list[Tensor] = []
 
     def note(self, name: str, step: int, tensor: Tensor) -> None:
-        """Look at a tensor of a step without waiting for its device; ``name`` is for the message."""
+        """Record a tensor of a step without waiting for its device; ``name`` is for the message."""
         self._names.append((name, step))
         self._finite.append(torch.isfinite(tensor.detach()).all())
 
@@ -56,13 +55,13 @@ class FiniteWatch:
         bad_value(f"{name} of denoising step {step + 1}", f"finite in {short}", "NaN or infinity in it", cure)
 
 
-#: The plain rule, but the latent follows the sum of the loss over its pixels, since Eq. 14 is a norm. Along
-#: the mean the printed step of 1e-2 moves a latent by less than a thousandth.
+#: The plain rule, but the latent follows the sum of the loss over pixels, since Eq. 14 is a norm. Along the
+#: mean the printed step of 1e-2 moves a latent by less than a thousandth.
 SUMMED = "summed"
 
 
 class Rule(Protocol):
-    """How far one gradient moves a tensor; made anew for every trajectory."""
+    """How far a gradient moves a tensor; every trajectory has its own instance."""
 
     def step(self, gradient: Tensor, reference: Tensor | None = None) -> Tensor:
         """What to add, for ``gradient`` (B, ...); ``reference`` (B, ...) is for rules that need it."""

@@ -1,4 +1,4 @@
-"""What a guided call does at every denoising step, decided once a call; ``print`` shows it."""
+"""``Schedule``: what a guided call does at every denoising step, decided once; ``print`` shows it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from geodiff_plugin.config import GuidanceConfig, UpdatePlan
 
 
 class Round(NamedTuple):
-    """A correction or none, then so many gradient updates; with neither, the scale is settled."""
+    """One optional correction, then ``updates`` gradient updates; with neither, only the scale is found."""
 
     corrects: bool
     updates: int
@@ -18,9 +18,9 @@ class Round(NamedTuple):
 
 @dataclass(frozen=True)
 class Schedule:
-    """Every denoising step of a guided call: the rounds of each that runs, none where it is the prior's own.
+    """The rounds of every denoising step of a guided call that runs; an empty entry leaves a step unchanged.
 
-    ``skipped`` steps before them are left out by a warm start; ``moves``: rounds move latents too.
+    ``skipped`` is the number of steps before them that a warm start omits; ``moves``: rounds move latents.
     """
 
     steps: tuple[tuple[Round, ...], ...]
@@ -32,7 +32,7 @@ class Schedule:
         return step == len(self.steps) - 1
 
     def moves_at(self, step: int) -> bool:
-        """Whether the step differs from the prior's own."""
+        """Whether guidance changes the latent at this step."""
         return self.moves and any(r.corrects or r.updates for r in self.steps[step])
 
     def __str__(self) -> str:
@@ -55,8 +55,8 @@ class Schedule:
 def count_steps(wanted: int, requested: int | None, most: int | None) -> tuple[int, int]:
     """Denoising steps of a guided call, and rounds in each.
 
-    A prior that takes at most ``most`` steps, fewer than the ``wanted``, makes the rounds of all of them in
-    those that it has. To request more of such a prior raises ``InputError``.
+    A prior that takes at most ``most`` steps runs the rounds of all ``wanted`` steps within them.
+    ``InputError`` if the user ``requested`` more steps than that.
     """
     if most is None or wanted <= most:
         return wanted, 1
@@ -75,13 +75,13 @@ def make_schedule(
     skipped: int = 0,
     encodes: bool = True,
 ) -> Schedule:
-    """The schedule of so many steps of so many rounds, after ``skipped`` steps of a warm start.
+    """The schedule of ``steps`` steps with ``rounds`` rounds each, after ``skipped`` steps of a warm start.
 
     Early estimates are vague, and later corrections replace what earlier ones did. So the last active round
     is corrected, and the others are spread over the second half of the active rounds, or over more of them if
     they do not fit there. An estimate that was corrected in a round without updates is not corrected again in
-    the same step: it would be fitted to the same matches, which only follows their noise. Nothing is
-    corrected where a map cannot be encoded (``encodes``), as guidance moves z_t.
+    the same step: a second fit to the same matches would follow their noise. Nothing is
+    corrected unless a map can be encoded (``encodes``), which it cannot while guidance moves z_t.
     """
     count = (skipped + steps) * rounds
     active = [i for i in range(count) if config.start <= i / count < config.stop]

@@ -1,11 +1,10 @@
-"""The scale of a relative map (S7.3), in this order (``_ends_of_image``).
+"""Find the scale of a relative map (S7.3), in this order (``_ends_of_image``).
 
-1. ``search_scale``: near and far by lookup in the cost volume, at the first step, or at every one where too
+1. ``search_scale``: near and far by lookup in the cost volume, at the first step, or at every step if too
    few matches are reliable; without a right view ``fit_to_points`` instead.
-2. ``refine_to_matches``, then ``fit_to_points`` on reliable matches: which minimum of the search is right.
-3. ``refine_to_matches``: the fit within it, to the matches and then to the points, which have the last word.
+2. ``refine_to_matches``, then ``fit_to_points`` on reliable matches: choose among the search's minima.
+3. ``refine_to_matches``: fit within that minimum, first to the matches, then to the points.
 4. ``ordered``: near stays below far, and both within a given range.
-3. ``refine_to_matches``: the fit within it, to the matches, then to the points, which have the last word.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _Ends = tuple[Tensor, Tensor]
 
 
 def span_of_points(evidence: Sequence[Evidence]) -> _Ends:
-    """The nearest and the farthest point of every sample, which all have some."""
+    """The nearest and the farthest point of every sample; all samples have points."""
     spans = [depth_span(points) for sample in evidence if (points := sample.points) is not None]
     nearest, farthest = zip(*spans, strict=True)
     return torch.stack(nearest), torch.stack(farthest)
@@ -35,7 +34,7 @@ def span_of_points(evidence: Sequence[Evidence]) -> _Ends:
 
 @torch.no_grad()
 def search_one_number(x: Tensor, objective: Objective) -> tuple[AffineState, Tensor]:
-    """The paper's s_hat = t_hat = 0 and the g_s of least photometric loss; whether that is on the edge."""
+    """The g_s of least photometric loss at the paper's s_hat = t_hat = 0, and whether it is on the edge."""
     config, zero = objective.config, x.new_zeros(x.shape[0])
     low, high = config.g_s_range
     candidates = torch.linspace(low, high, config.g_s_candidates, dtype=torch.float32, device=x.device)
@@ -43,7 +42,7 @@ def search_one_number(x: Tensor, objective: Objective) -> tuple[AffineState, Ten
     def cost(g_s: Tensor) -> Tensor:
         affine = AffineState(zero, zero, g_s.expand_as(zero))
         loss = objective(x, affine, affine, zero.view(-1, 1), zero.view(-1, 1), None)
-        # What no right camera sees costs nothing, and must not win for that.
+        # A scene that no right camera sees costs nothing, and must not win.
         shown = (loss.visible_fraction > 0) & (loss.visible_fraction >= config.min_visible)
         return loss.terms["photometric"].where(shown, torch.inf)
 
@@ -63,9 +62,9 @@ def settle_ends(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Metres ``(B,)`` of both ends of maps ``x (B, 1, h, w)``, and whether they are on the edge of the range.
 
-    ``evidence`` is of every sample; samples of one of the ``owners``, the images, lie side by side.
-    ``current`` ends stay unless a better basin shows up; ``on_edge`` is of the search before, ``None`` at the
-    first; ``valid`` is where the maps say something.
+    ``evidence`` has an entry per sample, as has ``owners``, the image of each; samples of one image lie side
+    by side. ``current`` ends stay unless a better basin shows up; ``on_edge`` is the result before, ``None``
+    at first; ``valid`` marks the pixels where the prior gives a depth.
     """
     results = []
     for image in sorted(set(owners)):

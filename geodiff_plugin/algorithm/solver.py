@@ -21,8 +21,8 @@ COARSEST_SIDE, COARSEST_STEPS = 24, 80
 class FieldSystem:
     """The minimiser ``u`` of ``sum weight (u - data)^2 + sum link |grad u|^2``, a channel at a time.
 
-    ``weight (B, 1, H, W)`` is above 0 in every part that links connect, ``pull (B, C, H, W)`` is weight times
-    data; links lie ``across`` ``(B, 1, H, W - 1)`` and ``down``, >= 0.
+    ``weight (B, 1, H, W)`` is above 0 somewhere in each connected part, ``pull (B, C, H, W)`` is weight times
+    data; links >= 0 lie ``across`` ``(B, 1, H, W - 1)`` and ``down`` ``(B, 1, H - 1, W)``.
     """
 
     weight: Tensor
@@ -48,16 +48,16 @@ class FieldSystem:
 
 
 def _cells(x: Tensor, cell: tuple[int, int], size: tuple[int, int]) -> Tensor:
-    """Sums over cells of so many rows and columns, on a grid of ``size``; zeros complete the last cells."""
+    """Sums over cells of ``(rows, columns)`` pixels, on a grid of ``size``, padded with zeros."""
     rows, columns = cell
     x = F.pad(x, (0, size[1] * columns - x.shape[-1], 0, size[0] * rows - x.shape[-2]))
     return F.avg_pool2d(x, (rows, columns)) * (rows * columns)
 
 
 def solve_field(system: FieldSystem, steps: int, start: Tensor | None = None) -> Tensor:
-    """The field ``(B, C, H, W)`` of a system, by so many conjugate-gradient steps on each finer grid.
+    """The field ``(B, C, H, W)`` of a system, by ``steps`` conjugate-gradient steps on each finer grid.
 
-    Without a ``start`` that is near already the coarser grids give it. A fixed amount of work.
+    Without ``start``, a field near the solution, coarser grids are solved first. The work is fixed.
     """
     height, width = system.weight.shape[-2:]
     if start is not None:
@@ -71,7 +71,7 @@ def solve_field(system: FieldSystem, steps: int, start: Tensor | None = None) ->
 
 
 def _conjugate_gradients(system: FieldSystem, x: Tensor, steps: int) -> Tensor:
-    """``x`` after so many steps, with the diagonal as the preconditioner.
+    """``x`` after ``steps`` steps, with the diagonal as the preconditioner.
 
     The system is scaled to a diagonal of 1, and vectors change in place: most of the time goes to memory.
     """
@@ -113,11 +113,11 @@ def solve_robust(
     rounds: int,
     steps: int,
 ) -> tuple[Tensor, Tensor]:
-    """The field of iteratively reweighted least squares, and the weights of another round.
+    """The field of iteratively reweighted least squares, and the weights for one more round.
 
-    ``data (B, C, H, W)`` is what each pixel asks for, ``inertia (B, 1, 1, 1)`` a pull towards 0, ``weights
-    (B, 1, H, W)`` are those of the first round; ``robust`` makes the next from what the first channel's field
-    leaves of its data. ``links`` as in ``FieldSystem``, ``steps`` as for ``solve_field``.
+    ``data (B, C, H, W)`` are the observations, ``inertia (B, 1, 1, 1)`` pulls towards 0, ``weights (B, 1, H,
+    W)`` are those of the first round; ``robust`` makes the next ones from the residuals of the first channel.
+    ``links`` as in ``FieldSystem``, ``steps`` as for ``solve_field``.
     """
     field: Tensor | None = None
     for _ in range(rounds):

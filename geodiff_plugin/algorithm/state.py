@@ -1,4 +1,4 @@
-"""What Algorithm 1 carries along for a chunk of samples: scale, shift and g_s, optimisers, matches."""
+"""``Trajectory``: scale, shift and g_s, optimisers and matches of a chunk of samples, step by step."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ from geodiff_plugin.types import StepReport
 
 
 class Trajectory:
-    """One chunk of samples along the schedule; those of an image, of the ``owners``, lie side by side.
+    """State of one chunk of samples through the schedule.
 
-    The search for the scale starts from ``prior_range``, metres ``(B,)`` of ``x = 0`` and ``x = 1`` by a
-    metric prior, or from ``start_range``, both ends of another frame. ``valid (B, 1, h, w)`` bool is where
-    the prior says something: elsewhere its map has no part in the scale, and matches alone decide.
+    ``owners`` is the image of each sample; samples of one image lie side by side. The scale search starts
+    from ``prior_range``, a metric prior's metres ``(B,)`` at ``x = 0`` and ``x = 1``, or ``start_range``, the
+    nearest and the farthest depth of the previous frame. Where ``valid (B, 1, h, w)`` bool is false the prior
+    gives no depth: there its map does not count for the scale, and matches alone decide.
     """
 
-    affine: AffineState  # of the latest update, once ``settle_scale`` was called
-    kept: Tensor | None = None  # (B, 1, H, W), share of each match's confidence without reflections
-    error: Tensor | None = None  # (B, 1, 1, 1) of the prior's first estimate (``correction.prior_error``)
+    affine: AffineState  # after the latest update; set by ``settle_scale``
+    kept: Tensor | None = None  # (B, 1, H, W), factor on the confidence of matches, 0 for reflections
+    error: Tensor | None = None  # (B, 1, 1, 1), ``correction.prior_error`` of the first estimate
     hidden: Tensor | None = None  # (B, V, 1, H, W) bool, what the estimate hides from the right cameras
     order: Tensor | None = None  # (B,), rank correlation of the prior's first map and matches or points
     prior_depth: Tensor | None = None  # (B, 1, h, w) metres, a metric prior's first estimate
@@ -51,7 +52,7 @@ class Trajectory:
     ) -> None:
         self.config, self.owners, self.valid = config, list(owners), valid
         samples = self._samples = [evidence[i] for i in owners]
-        self._evidence = samples  # what the prior is held against
+        self._evidence = samples  # what the prior is compared with, where it is valid
         if valid is not None:
             self._evidence = [within(e, v) for e, v in zip(samples, valid, strict=True)]
         self.metric = MetricMap(space, config.positive)
@@ -61,11 +62,11 @@ class Trajectory:
         pixels = math.prod(self.objective.views.size) if config.rule == SUMMED else 1
         self.latent_rule = RULES[config.rule](step_latents * pixels)
         self.scale_rule, self.shift_rule = (RULES[config.rule](config.step_affine) for _ in range(2))
-        # Of a disparity, x = 1 is the nearest end.
+        # Sorted into nearest and farthest: for disparity x = 1 is the nearest.
         self._prior_range = None if prior_range is None else tuple(torch.stack(prior_range).sort(0).values)
         self._start_range = self._prior_range if start_range is None else start_range
-        self._affine_start: AffineState | None = None  # what the search gave, which the loss pulls towards
-        if start_range is not None:  # the frame before has searched
+        self._affine_start: AffineState | None = None  # the search's result, which the loss pulls towards
+        if start_range is not None:  # found by the search of the previous frame
             self.on_edge = torch.zeros_like(start_range[0], dtype=torch.bool)
         self.history: list[StepReport] = []
         self.watch = FiniteWatch()
@@ -76,7 +77,7 @@ class Trajectory:
         self.watch.note(name, self.step[0], tensor)
 
     def prepare(self, x: Tensor, z0: Tensor) -> None:
-        """What an estimate ``x``, decoded from ``z0``, decides first: the scale, which matches to believe."""
+        """Find the scale of an estimate ``x``, decoded from ``z0``; at the first one judge the matches."""
         self.note("the network's clean latent", z0)
         self.note("the decoded map", x)
         if self._prior_range is not None and self.prior_depth is None:
@@ -87,7 +88,7 @@ class Trajectory:
         self._judge_matches(x)
 
     def settle_scale(self, x: Tensor) -> None:
-        """Find g_s and the start of scale and shift for a relative map (S7.3), or better ones than before."""
+        """Search g_s and the start of scale and shift for a relative map (S7.3), or improve those in use."""
         is_first = self._affine_start is None
         if self.config.search == "volume":
             ends = self._start_range if is_first else self.metric.range_of(self.affine)
@@ -104,7 +105,7 @@ class Trajectory:
             self.affine = self._affine_start = start
 
     def _order(self, x: Tensor) -> Tensor:
-        """How far the prior alone agrees with matches or points on near and far; NaN where neither tells."""
+        """Rank correlation ``(B,)`` of the prior alone with matches or points; NaN without enough of them."""
         order = x.new_full((x.shape[0],), torch.nan)
         for i, evidence in enumerate(self._evidence):
             target = evidence.matches or evidence.points
@@ -113,7 +114,7 @@ class Trajectory:
         return order
 
     def _judge_matches(self, x: Tensor) -> None:
-        """Which matches look like reflections, and how wrong the prior is, by its first estimate alone."""
+        """At the first estimate: find matches that look like reflections, and measure the prior's error."""
         if self.error is not None or (self.matches is None and self.points is None):
             return
         config, depth_m = self.config, self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
@@ -122,7 +123,7 @@ class Trajectory:
             if config.reject_reflections:
                 judged = self.matches if self.valid is None else self.matches.within(self.valid)
                 self.kept = reject_reflections(judged, depth_m)
-                if self.valid is not None:  # nothing is behind what is not there
+                if self.valid is not None:  # without a prior depth no match is a reflection
                     inside = F.interpolate(self.valid.float(), depth_m.shape[-2:], mode="nearest-exact")
                     self.kept = torch.where(inside > 0, self.kept, 1.0)
         if config.correct or config.crisp:
@@ -136,7 +137,7 @@ class Trajectory:
         return correction_target(self.matches, self.points, self.kept, error, depth_m)
 
     def find_hidden(self, x: Tensor) -> None:
-        """Find what a map hides from the right cameras; it holds for a round's updates."""
+        """Find the pixels that a map hides from the right cameras, for all updates of a round."""
         compared = self.config.weights.get("photometric") and self.objective.views.further
         if self.config.z_test and compared:
             self.hidden = self.objective.hidden(x, self.affine)
@@ -149,7 +150,7 @@ class Trajectory:
         if target is None or error is None:
             return x
         _, _, field = refine_depth(depth_m, target, self.objective.views.left_01, error, self.config)
-        # A factor, not a difference of maps: interpolated over an edge the latter is an error on either side.
+        # Resample the factor, not the difference of maps, which would be wrong on both sides of an edge.
         field = F.interpolate(field, x.shape[-2:], mode="bilinear", antialias=True)
         return self.metric.relative(self.metric(x, self.affine) * torch.exp(-field), self.affine)
 

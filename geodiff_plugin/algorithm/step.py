@@ -1,6 +1,6 @@
-"""One guided denoising step: ``gradient_step`` is Algorithm 1, ``corrected_step`` the default's.
+"""One guided denoising step: ``gradient_step`` is Algorithm 1, ``corrected_step`` the default.
 
-Source: Algorithm 1, with Eq. 16 and 17, which it omits, and the decode of z0_hat, where it prints z_0.
+Source: Algorithm 1, with Eq. 16 and 17, which it omits; z0_hat is decoded, where it prints z_0.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Estimate(Protocol):
     Attributes:
         latent: ``(B, C, h, w)`` float32, what guidance moves: z_t ("full") or z0_hat ("denoised").
         eps: ``(B, C, h, w)`` the predicted noise, the yardstick of the rule ``adam-norm``.
-        latent_is_read: whether anyone reads the latent after this step; the last map itself is the result.
+        latent_is_read: whether the latent is used after this step; if not, the last map is the result.
     """
 
     latent: Tensor
@@ -31,10 +31,10 @@ class Estimate(Protocol):
     latent_is_read: bool
 
     def z0(self, latent: Tensor) -> Tensor:
-        """The clean latent of a guided one: Tweedie with the network's graph, or the identity."""
+        """The clean latent of ``latent``: Tweedie through the network ("full"), or the identity."""
 
     def decode(self, z0: Tensor, final: bool = False) -> Tensor:
-        """D: unclipped relative map ``(B, 1, h', w')`` float32; ``final`` of a map that may be the result."""
+        """D: unclipped relative map ``(B, 1, h', w')`` float32; ``final`` if it may be the result."""
 
     def encode(self, x: Tensor) -> Tensor:
         """The clean latent of a relative map."""
@@ -43,11 +43,11 @@ class Estimate(Protocol):
 def gradient_step(
     state: Trajectory, estimate: Estimate, z: Tensor, anchor: Tensor, is_first: bool
 ) -> tuple[Tensor, Tensor, Loss]:
-    """One pass of Algorithm 1's loop body, but for the score before it and the DDIM line after it.
+    """One pass of Algorithm 1's loop body, without the score before it and the DDIM line after it.
 
-    It moves ``z (B, C, h, w)``, z_t or z0_hat, and advances the state's scale s_hat, shift t_hat and their
-    optimisers. g_s is searched if it ``is_first`` of its round (S7.3). ``anchor`` is the clean latent that
-    the term of that name pulls towards. Returns z, the relative map of z as it was, and its loss.
+    It moves ``z (B, C, h, w)``, z_t or z0_hat, and updates scale s_hat, shift t_hat and the optimisers in
+    ``state``. The first update of a round (``is_first``) also searches g_s (S7.3). ``anchor`` is the clean
+    latent that the anchor term pulls towards. Returns the moved z; the relative map and loss before the move.
     """
     moves = state.config.optimize_latents
     with torch.enable_grad():
@@ -64,7 +64,7 @@ def gradient_step(
         affine = replace(state.affine, s_hat=s_hat, t_hat=t_hat)
         L_geo = state.loss(x0, affine, z0, anchor)  # Eq. 14 of Eq. 16's metric depth, with Eq. 17
         inputs = (s_hat, t_hat, x0, z0) if moves else (s_hat, t_hat)
-        total = L_geo.total.sum()  # samples do not mix, so its gradient is each one's own
+        total = L_geo.total.sum()  # samples are independent, so the sum has each sample's gradient
         grad_s, grad_t, *grads = torch.autograd.grad(total, inputs, allow_unused=True, materialize_grads=True)
     s_hat = s_hat.detach() + state.scale_rule.step(grad_s)  # s_hat - lambda_s grad L_geo
     t_hat = t_hat.detach() + state.shift_rule.step(grad_t)  # t_hat - lambda_t grad L_geo
@@ -81,24 +81,24 @@ def gradient_step(
 def corrected_step(
     state: Trajectory, estimate: Estimate, z0: Tensor, is_result: bool
 ) -> tuple[Tensor, Tensor]:
-    """The decoded map fitted to matches and points, and the change encoded: clean latent and relative map.
+    """Fit the decoded map to matches and points and encode the change; returns clean latent and relative map.
 
-    The latent ``z0 (B, C, h, w)`` moves by the difference of two codes, so that what the autoencoder loses is
-    not lost again at every step, and a map that needs no correction leaves it as it is. If no round follows
-    (``is_result``) the map is left to the refinement of the output, if there is one: fitted to the matches
-    twice it would follow their noise. It is encoded only if the latent is read.
+    The latent ``z0 (B, C, h, w)`` moves by the difference between the encodings of the two maps: so the
+    autoencoder's loss does not add up, and a map that needs no correction leaves the latent unchanged. If no
+    round follows (``is_result``) and the output will be refined (``crisp``), the uncorrected map is returned:
+    fitted to the matches twice it would follow their noise. The map is encoded only if the latent is read.
 
     Source: Gregorek and Nalpantidis 2024, "SteeredMarigold".
     """
     x = estimate.decode(z0, final=is_result)
     state.prepare(x, z0)
-    unread = is_result and not estimate.latent_is_read
+    unused = is_result and not estimate.latent_is_read
     refined_later = is_result and state.config.crisp
-    if unread and refined_later:
+    if unused and refined_later:
         return z0, x
     corrected = state.corrected(x)
     state.note("the corrected map", corrected)
-    if corrected is not x and not unread:
+    if corrected is not x and not unused:
         z0 = z0 + estimate.encode(corrected) - estimate.encode(x)
         state.note("the encoded correction", z0)
     return z0, x if refined_later else corrected
@@ -107,13 +107,13 @@ def corrected_step(
 def guided_step(
     state: Trajectory, estimate: Estimate, rounds: tuple[Round, ...], is_last: bool
 ) -> tuple[Tensor, Tensor, bool]:
-    """The rounds of one denoising step: what to add to the latent, the relative map of the latest evaluation.
+    """Run the rounds of one denoising step.
 
-    And whether that map stands for the moved latent, so that the output may start from it.
+    Returns the change of the latent, the latest relative map, and whether the moved latent decodes to it.
     """
-    z, anchor, x, stands = estimate.latent, None, None, False
+    z, anchor, x, is_current = estimate.latent, None, None, False
     for k, (corrects, updates) in enumerate(rounds):
-        stands = corrects and not updates
+        is_current = corrects and not updates
         if corrects:
             is_result = is_last and k == len(rounds) - 1 and not updates
             moved, x = corrected_step(state, estimate, z, is_result)
@@ -135,4 +135,4 @@ def guided_step(
             losses.append(state.loss(x, state.affine, z0, anchor))
         state.report(losses[0])
     assert x is not None  # there is one round at least
-    return (z - estimate.latent).detach(), x, stands
+    return (z - estimate.latent).detach(), x, is_current

@@ -21,27 +21,27 @@ from geodiff_plugin.geometry import hidden_in_right, image_size, warp_right_to_l
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import AffineState, MetricMap
 
-#: A pyramid level with a shorter side than this says nothing that its parent does not.
+#: Pyramid levels with a shorter side than this are left out.
 MIN_SIDE = 24
 #: SSIM's two constants for images in [0, 1].
 C1, C2 = 0.01**2, 0.03**2
 #: The 3 taps of its Gaussian window of 1.5 pixels, before they sum to 1.
 _TAP = math.exp(-0.5 / 1.5**2)
 TAP_BESIDE, TAP_CENTRE = _TAP / (1.0 + 2.0 * _TAP), 1.0 / (1.0 + 2.0 * _TAP)
-#: More than any error of a view that sees the pixel.
+#: Photometric error of a view that does not see the pixel: above any other.
 UNSEEN = 2.0
-#: Added to a spread, so that a blank image divides nothing by zero.
+#: Added to a spread, so that a blank image causes no division by zero.
 BLANK_SPREAD = 1e-3
-#: Gains beyond these say that two photographs do not show the same scene.
+#: Bounds of the exposure gain; beyond them two photographs do not show the same scene.
 GAINS = (0.2, 5.0)
-#: Rows and columns of the field of slow shading: vignetting, sun from one side; and the share of a cell in
-#: view that counts as much as the mean of the whole image.
+#: Rows and columns of the smooth shading field (vignetting, sun from one side); share of a cell in view at
+#: which the cell's mean counts half.
 CELLS, CELL_PRIOR = (4, 5), 0.2
 #: Errors at points up to this share of the unit are float32's rounding and pull no more: a rule that gives
 #: every gradient the same length would follow their sign.
 ROUNDING = 1e-3
 #: Residual of matches, in planes, and of points, in their unit, from which their pull falls: a wrong match
-#: must not win against its neighbours, but a surface that the prior put far away must still feel where it is.
+#: must not win against its neighbours, but a surface that the prior misplaces must still be pulled back.
 TERM_CAUCHY = 5.0
 #: Share of the anchor's pull that remains where every pixel is matched.
 ANCHOR_FLOOR = 0.05
@@ -110,15 +110,15 @@ def photometric(left_01: Tensor, warped_01: Tensor, visible: Tensor, config: Gui
     """Mean photometric error over the visible pixels, averaged over an image pyramid, ``(B,)`` in [0, 1].
 
     ``left_01 (B, 3, H, W)``, ``warped_01 (B, V, 3, H, W)`` every right image seen from the left, ``visible
-    (B, V, 1, H, W)`` bool. Each pixel takes the view that explains it best among those that see it: one in
-    which something hides it then does not count (Godard et al. 2019, "Digging into self-supervised monocular
+    (B, V, 1, H, W)`` bool. Each pixel takes the least error of the views that see it, so a
+    view in which it is occluded does not count (Godard et al. 2019, "Digging into self-supervised monocular
     depth estimation", Eq. 4). Coarser levels widen the basin of attraction.
 
     Source: Eq. 14 (eq:geo-loss). Deviation: the mask (the paper's mean over all pixels rewards depths that
         push pixels out of the right image) and the pyramid.
     """
     views = warped_01.shape[1]
-    left = left_01.repeat_interleave(views, 0)  # (B V, 3, H, W), a view's pixels by themselves
+    left = left_01.repeat_interleave(views, 0)  # (B V, 3, H, W), one entry per view
     warped, mask = warped_01.flatten(0, 1), visible.flatten(0, 1).to(left.dtype)
     if config.exposure:
         warped = match_exposure(warped, left, mask)
@@ -150,20 +150,20 @@ class Compared(NamedTuple):
     depth_m: Tensor  # (B, 1, H, W) metres, carries the graph
     left_01: Tensor  # (B, 3, H, W)
     warped_01: Tensor  # (B, V, 3, H, W) every right image seen from the left through ``depth_m``
-    visible: Tensor  # (B, V, 1, H, W) bool: in view of that camera, and not hidden from it as far as we know
+    visible: Tensor  # (B, V, 1, H, W) bool: in view of that camera, and not known to be hidden from it
     affine: AffineState  # carries the graph
-    affine_start: AffineState  # where the search put it
+    affine_start: AffineState  # the search's result
     z0: Tensor  # (B, C, h, w) current clean latent, carries the graph
     anchor: Tensor  # (B, C, h, w) the network's clean latent of this step, moved by its corrections
-    matches: Matches | None  # those that are believed
+    matches: Matches | None  # without reflections
     points: Matches | None = None  # depths that the user knows
     config: GuidanceConfig = DEFAULT
 
 
 class Term(NamedTuple):
-    """A function from ``Compared`` to ``(B,)``, and the input without which it is left out.
+    """A function from ``Compared`` to ``(B,)``, and the input that it needs; without that it is left out.
 
-    ``needs`` is ``"views"``, ``"matches"``, ``"points"``, or empty for what every call has.
+    ``needs`` is ``"views"``, ``"matches"``, ``"points"``, or empty if every call has the input.
     """
 
     function: Callable[[Compared], Tensor]
@@ -219,9 +219,9 @@ def prior_pull_term(compared: Compared) -> Tensor:
 
 
 def anchor_term(compared: Compared) -> Tensor:
-    """Mean squared distance of the clean latent from its anchor, less where matches are.
+    """Mean squared distance of the clean latent from its anchor, weighted down where there are matches.
 
-    With several inner updates it keeps unmatched regions with the prior: the proximal form of one diffusion
+    With several inner updates it keeps unmatched regions near the prior: the proximal form of one diffusion
     posterior step (S3.2 takes a single gradient step instead).
     """
     square = (compared.z0 - compared.anchor).pow(2).mean(1, keepdim=True)  # (B, 1, h, w)

@@ -1,7 +1,7 @@
 """What the views alone say about depth: plane sweep, aggregation, left-right check, for any pose (S7.3)."""
 
 from geodiff_plugin.matching.aggregation import aggregate
-from geodiff_plugin.matching.build import build_cost_volume, mirrored_pose_preferred, to_grid
+from geodiff_plugin.matching.build import build_cost_volume, inverse_pose_preferred, to_grid
 from geodiff_plugin.matching.cleaning import clean
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches, points_to_matches, reject_reflections, with_points
@@ -13,8 +13,8 @@ __all__ = [
     "aggregate",
     "build_cost_volume",
     "clean",
+    "inverse_pose_preferred",
     "match_volume",
-    "mirrored_pose_preferred",
     "points_to_matches",
     "reject_reflections",
     "sweep_planes",

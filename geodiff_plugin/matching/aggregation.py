@@ -12,27 +12,27 @@ from geodiff_plugin.matching.census import COST_LEVELS
 
 #: Cost of a step of one plane between neighbouring pixels, in units of the largest matching cost.
 STEP_PENALTY = 0.15
-#: Of any larger step where the image is flat, and the difference in brightness that halves it.
+#: Cost of any larger step where the image is flat; difference in brightness that halves this cost.
 JUMP_PENALTY, JUMP_CONTRAST = 1.2, 0.1
 #: Up, down, left and right.
 PATHS = 4
-#: Above any sum over the paths: in a place that is not to win.
+#: Above any sum over the paths; marks a plane that must not win.
 NEVER = 20_000
 
 
-def cells(planes: int, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Memory ``(planes, N, M)``, not filled, for ``size = (N, M)``, as a path from row to row reads it."""
+def empty_volume(planes: int, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Uninitialised ``(planes, N, M)`` for ``size = (N, M)``, laid out for paths from row to row."""
     return torch.empty(size[0], planes, size[1], dtype=dtype, device=device).transpose(0, 1)
 
 
-class Room:
-    """Memory reused from one aggregation to the next: touching fresh memory costs as much as a path."""
+class Buffers:
+    """Buffers reused from one aggregation to the next: touching fresh memory costs as much as a path."""
 
     def __init__(self) -> None:
         self._held: dict[str, Tensor] = {}
 
-    def cells(self, name: str, planes: int, size: tuple[int, int], like: Tensor) -> Tensor:
-        """``cells`` in the memory of this name; what it held before is lost."""
+    def empty(self, name: str, planes: int, size: tuple[int, int], like: Tensor) -> Tensor:
+        """``empty_volume`` in the buffer of this name, whose former content is lost."""
         count, held = planes * size[0] * size[1], self._held.get(name)
         if held is None or held.numel() < count:
             held = self._held[name] = torch.empty(count, dtype=like.dtype, device=like.device)
@@ -46,7 +46,7 @@ def _scan_rows(cost: Tensor, p1: int, p2: Tensor, total: Tensor) -> None:
     larger one between row n - 1 and row n.
     """
     planes, count, breadth = cost.shape
-    # Both directions advance together, entry 0 down and entry 1 up; a plane more at either end never wins.
+    # Both directions advance together, entry 0 down and entry 1 up; the padding at both ends never wins.
     padded = total.new_full((2, planes + 2, breadth), NEVER)
     path, before, after = padded[:, 1:-1], padded[:, :-2], padded[:, 2:]
     step, least = total.new_empty(2, planes, breadth), total.new_empty(2, 1, breadth)
@@ -79,22 +79,22 @@ def _limits(grey: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def aggregate(levels: Tensor, grey: Tensor, *, room: Room | None = None) -> Tensor:
+def aggregate(levels: Tensor, grey: Tensor, *, buffers: Buffers | None = None) -> Tensor:
     """Sums ``(D, H, W)`` int16, below ``NEVER``, of costs ``(D, H, W)`` uint8 along four paths.
 
-    A brightness edge in ``grey (H, W)``, the same view in [0, 1], makes a jump in depth cheaper. ``room`` is
-    memory to work in, which holds the result until its next use.
+    A brightness edge in ``grey (H, W)``, the same view in [0, 1], makes a jump in depth cheaper. The result
+    stays in ``buffers`` until their next use.
 
     Source: Hirschmueller 2008, Eq. 13.
     """
     vertical, horizontal = _limits(grey)
     step = round(COST_LEVELS * STEP_PENALTY)
     planes, height, width = levels.shape
-    room, paths = room or Room(), levels.new_empty(0, dtype=torch.int16)
-    turned = room.cells("turned", planes, (width, height), levels)
-    sideways = room.cells("sideways", planes, (width, height), paths)
-    total = room.cells("total", planes, (height, width), paths)
-    # Plane by plane and from piece to piece: so a transposition goes by blocks, several times as fast.
+    buffers, paths = buffers or Buffers(), levels.new_empty(0, dtype=torch.int16)
+    turned = buffers.empty("turned", planes, (width, height), levels)
+    sideways = buffers.empty("sideways", planes, (width, height), paths)
+    total = buffers.empty("total", planes, (height, width), paths)
+    # Contiguous copies plane by plane make the transposition several times as fast.
     for plane, source in zip(turned, levels, strict=True):
         plane.copy_(source.contiguous().T.contiguous())
     _scan_rows(turned, step, horizontal, sideways.zero_())

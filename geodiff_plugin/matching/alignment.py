@@ -14,16 +14,16 @@ from torch import Tensor
 from geodiff_plugin.geometry import EDGE_PX, image_size, sample_at
 from geodiff_plugin.matching.census import MARGIN_PX, census, census_cost, grey_levels
 
-# A view that needs no turning to within this is taken as it is.
+# A view that turning would move by less than this stays as it is.
 _AS_IT_IS_PX = 0.02
 # Planes that come nearer to the right camera's plane than this share of their depth are not seen.
 _LEAST_RATIO = 0.02
-# Where many planes are plain shifts along the rows, the right image is described once at this many positions
-# a pixel, along the row and across.
+# Where many planes are plain shifts along the rows, the census of the right image is computed once at this
+# many positions per pixel, along the row and across.
 _PHASES, _ROW_PHASES = 8, 4
-# So it is while the rows drift by no more than this: calibrations put a baseline a little out of the row.
+# Plain shifts may drift across the rows by this much: calibrated baselines lie a little out of the row.
 _MOST_DRIFT_PX = 1.0
-# Written out wherever a tensor is made: else the user's default device and dtype would apply.
+# Given wherever a tensor is made: otherwise the user's default device and dtype would apply.
 _CPU_FLOAT64: dict[str, Any] = {"device": "cpu", "dtype": torch.float64}
 
 
@@ -31,10 +31,10 @@ _CPU_FLOAT64: dict[str, Any] = {"device": "cpu", "dtype": torch.float64}
 class AlignedView:
     """A right image on a canvas with the left grid's orientation and pixels per radian.
 
-    A left pixel ``(u, v)`` on plane k lies at ``scale[k] * (u, v) + shift[k]`` of the canvas, so that a
-    plane's image is two look-ups of lines, and so is the way back. ``grey (h, w)``; ``valid (h, w)`` bool,
-    inside the right image, ``None`` for all of the canvas; ``scale (D,)``, 0 behind the right camera, and
-    ``shift (D, 2)``, column and row, are float64 on the CPU.
+    A left pixel ``(u, v)`` on plane k lies at ``scale[k] * (u, v) + shift[k]`` of the canvas, so warping by a
+    plane, either way, looks up rows and columns. ``grey (h, w)``; ``valid (h, w)`` bool, inside the right
+    image, ``None`` for all of the canvas; ``scale (D,)``, 0 behind the right camera, and ``shift (D, 2)``,
+    column and row, are float64 on the CPU.
     """
 
     grey: Tensor
@@ -57,7 +57,7 @@ class AlignedView:
         return at.to(self.grey.device, torch.float32)
 
     def sources(self, count: int, axis: int) -> Tensor:
-        """The way back: the left line that each line of the canvas shows, ``(D, n)``; ``count`` for none."""
+        """The inverse of ``positions``: the left line of each canvas line, ``(D, n)``; ``count`` for none."""
         lines = torch.arange(self.size[1 - axis], **_CPU_FLOAT64)
         scale = self.scale[:, None]
         at = ((lines - self.shift[:, axis, None]) / scale.clamp_min(1e-9)).round()
@@ -77,8 +77,7 @@ def align_view(
     """Turn a right view parallel to the left one; a rectified right image is its own canvas.
 
     ``right`` is ``(grey (1, Hr, Wr), K, T)``, ``size (H, W)`` the left grid, ``inverse_depth (D,)`` 1/m its
-    planes. The canvas covers what these see of the right image, at most three times as wide and high as the
-    left grid.
+    planes. The canvas covers the part of the right image on them, at most three left grids wide and high.
     """
     image, *matrices = right
     K_r, T, K = (matrix.detach().cpu().double() for matrix in (*matrices, K_left))
@@ -97,20 +96,20 @@ def align_view(
 
 
 def _turned(image: Tensor, to_right: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """A right image under a homography, from column and row ``low`` to ``high``, and what of it is inside."""
+    """A right image under a homography, from column and row ``low`` to ``high``, and its valid pixels."""
     columns, rows = (torch.arange(int(a), int(b) + 1, **_CPU_FLOAT64) for a, b in zip(low, high, strict=True))
     row, column = torch.meshgrid(rows, columns, indexing="ij")
     p = torch.stack([column, row, torch.ones_like(row)], dim=-1) @ to_right.T
     uv, ahead = p[..., :2] / p[..., 2:].clamp_min(1e-9), p[..., 2] > 1e-9
     last = uv.new_tensor([image.shape[-1] - 1, image.shape[-2] - 1])
     valid = ahead & ((uv >= -EDGE_PX) & (uv <= last + EDGE_PX)).all(dim=-1)
-    # Bicubic, since what is read here is interpolated once more on every plane.
+    # Bicubic, because the result is interpolated once more on every plane.
     turned = sample_at(image[None], uv[None].to(image), mode="bicubic")[0, 0].clamp(0.0, 1.0)
     return turned, valid.to(image.device)
 
 
 def _translation(to_right: Tensor, size: tuple[int, int]) -> Tensor | None:
-    """The shift ``(2,)`` that a homography amounts to on the left grid, or ``None``."""
+    """The shift ``(2,)`` that a homography equals on the left grid; ``None`` if it is no plain shift."""
     height, width = size
     ends = [[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]]
     corners = torch.tensor(ends, **_CPU_FLOAT64)
@@ -157,7 +156,7 @@ class ComparedView:
     """Costs of every plane between the left view and an aligned right view, and where it is seen."""
 
     def __init__(self, left: Tensor, view: AlignedView) -> None:
-        """Take ``left``, the ``census`` of the left view, ``(16, H, W)`` int16."""
+        """``left`` is the ``census`` of the left view, ``(16, H, W)`` int16."""
         self._view, (_, height, width) = view, left.shape
         self._columns = view.positions(width, 0, MARGIN_PX)
         self._rows = view.positions(height, 1, MARGIN_PX)
@@ -166,17 +165,17 @@ class ComparedView:
         self._rows_inside = view.inside(self._rows[:, inner], 1)
         self._shifts = self._even_shifts(width)
         self._left = left if self._shifts is None else left.to(torch.int8)
-        self._room = torch.empty_like(self._left)
+        self._work = torch.empty_like(self._left)
         self._phases: dict[tuple[int, int], Tensor] = {}
 
     def _even_shifts(self, width: int) -> list[tuple[int, int]] | None:
-        """Column and row shift of every plane in phases, where they say everything; else ``None``."""
+        """Column and row shift of every plane in phases; ``None`` if planes are more than shifts."""
         scale, shift = self._view.scale, self._view.shift
         drift = float(shift[:, 1].amax() - shift[:, 1].amin())
         uneven = drift > _MOST_DRIFT_PX or float((scale - 1.0).abs().amax()) * width > 1.0 / _PHASES
         if uneven or len(scale) < 4 * _PHASES:
             return None
-        # Further than its own width beyond the canvas, a plane shows the repeated edge and nothing else.
+        # A plane shifted further than the left width beyond the canvas shows only the repeated edge.
         columns = (shift[:, 0].clamp(-width, self._view.size[1]) * _PHASES).round().long()
         self._first = int(columns.amin()) // _PHASES
         self._count = int(columns.amax()) // _PHASES - self._first + width
@@ -187,7 +186,7 @@ class ComparedView:
         """``census`` of the right view for all shifts of a phase, int8; kept until the row changes."""
         if (column, row) not in self._phases:
             self._phases = {key: votes for key, votes in self._phases.items() if key[1] == row}
-            # Whole numbers would become positions of the user's default dtype.
+            # Integers would be promoted to the user's default dtype.
             dtype, device = torch.float32, self._columns.device
             rows = torch.arange(-MARGIN_PX, height + MARGIN_PX, dtype=dtype, device=device)
             rows = rows.clamp_(0, height - 1) + row / _ROW_PHASES
@@ -200,12 +199,12 @@ class ComparedView:
         """``(H, W)`` uint8, ``census_cost`` of a plane, whether seen or not."""
         if self._shifts is None:
             levels = _resampled(self._view.grey, self._rows[plane], self._columns[plane])
-            return census_cost(census(levels, self._room), self._left, self._room)
+            return census_cost(census(levels, self._work), self._left, self._work)
         _, height, width = self._left.shape
         column, row = self._shifts[plane]
         votes = self._phase(column % _PHASES, row, height)
         begin = column // _PHASES - self._first
-        return census_cost(votes[:, :, begin : begin + width], self._left, self._room)
+        return census_cost(votes[:, :, begin : begin + width], self._left, self._work)
 
     def seen(self, plane: int) -> Tensor:
         """``(H, W)`` bool: what the right view sees of a plane."""

@@ -18,35 +18,35 @@ from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.sweep import CostVolume, inverse_depth_at_shift, median_shift, sweep_planes
 from geodiff_plugin.types import CameraView
 
-# Fewer planes than this make no parabola worth the name.
+# With fewer planes, a parabola through three neighbouring costs fits nothing.
 _FEWEST_PLANES = 24
 #: How far the median pixel moves from one plane to the next, px: below a pixel, for positions between planes.
 PLANE_STEP_PX = 0.75
 # The coarse sweep that finds how near the planes must reach: pixels, planes.
 PILOT_PIXELS, PILOT_PLANES = 20_000, 160
-# And the median step of a plane.
+# The shift of the median pixel from one of its planes to the next, px.
 PILOT_STEP_PX = 1.0
-# Shift of the nearest depth that it looks at, in image widths, of the view that moves least: a near surface
-# leaves the view that moves most while others still show it. It looks no more than so many times nearer than
-# that depth of the view that moves most.
+# The coarse sweep reaches to the depth that shifts by the first number, in image widths, in the view that
+# moves least: a near surface leaves the view that moves most while others still show it. It reaches at most
+# the second number times nearer than that depth for the view that moves most.
 PILOT_SHIFT, MOST_NEARER = 0.4, 3.0
-# Its matches above this confidence count; this quantile of their inverse depths is taken for the nearest.
+# Matches of the coarse sweep above this confidence; the quantile of their inverse depth taken as nearest.
 PILOT_CONFIDENCE, PILOT_QUANTILE = 0.8, 0.995
-# Where they are less than this share of the pixels, the planes reach as near as the sweep looked.
+# If fewer pixels than this share have such a match, the planes reach as near as the coarse sweep did.
 PILOT_LEAST_SHARE = 0.03
-# The planes reach this factor nearer than that, and at least to the depth of this shift, in image widths.
+# The planes reach this factor nearer than the nearest match, and at least to this shift, in image widths.
 HEADROOM, LEAST_SHIFT = 1.25, 0.03
-# The inverse pose must match this many times as much of the image as the given one, in sweeps of so many
-# pixels.
+# The inverse pose is preferred if it matches this many times as much of the image as the given one; number
+# of pixels of the sweeps that compare them.
 _CLEARLY, _INVERSE_PIXELS = 1.25, 15_000
-# Where the given one matches this share of the image, it is not asked.
-_PLAINLY = 0.4
+# If the given pose matches this share of the image, the inverse pose is not tried.
+_ENOUGH_MATCHED = 0.4
 
 
 def to_grid(
     left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, pixels: int
 ) -> tuple[Tensor, tuple[CameraView, ...], Tensor]:
-    """The left view ``(C, H, W)`` in at most ``pixels``, right ones at as many pixels per radian, its K."""
+    """The left view ``(C, H, W)`` with at most ``pixels``, right views as fine, and K of the left one."""
     height, width = image_size(left_01)
     factor = min(1.0, (pixels / (height * width)) ** 0.5)
     size = max(1, round(height * factor)), max(1, round(width * factor))
@@ -102,13 +102,13 @@ def _at_shift(rights: Sequence[CameraView], K: Tensor, size: tuple[int, int], fr
 
 
 def _nearest_inverse_depth(pilot: CostVolume) -> Tensor:
-    """The inverse depth of the nearest surface, by a coarse sweep."""
+    """The inverse depth at which the planes end, somewhat nearer than the matches of a coarse sweep."""
     matches = match_volume(pilot)
     reliable, limit = matches.confidence > PILOT_CONFIDENCE, pilot.inverse_depth[-1]
     inverse_depth = torch.where(reliable, matches.inverse_depth, torch.nan)
     least = _at_shift(pilot.rights, pilot.K, pilot.size, LEAST_SHIFT).amin()
     nearest = (HEADROOM * torch.nanquantile(inverse_depth, PILOT_QUANTILE)).clamp(least, limit)
-    # With little to go by, the search must see everything.
+    # With few reliable matches the planes must span everything.
     return torch.where(reliable.float().mean() < PILOT_LEAST_SHARE, limit, nearest)
 
 
@@ -141,15 +141,15 @@ def build_cost_volume(
 
 
 @torch.no_grad()
-def mirrored_pose_preferred(
+def inverse_pose_preferred(
     left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, matches: Matches | None = None
 ) -> bool:
-    """Whether the inverse pose, true where images were swapped, matches clearly more of the image.
+    """Whether the inverse pose matches clearly more of the image than the given one.
 
-    It is also true where a world-to-camera pose was given. Two coarse sweeps decide, or none where
-    ``matches`` of the pose as given leave no doubt. Other arguments as for ``build_cost_volume``.
+    It does if the images were swapped, or if E is world-to-camera. Two coarse sweeps decide, or none if the
+    ``matches`` under the given pose leave no doubt. Other arguments as for ``build_cost_volume``.
     """
-    if matches is not None and float(matches.confidence.mean()) > _PLAINLY:
+    if matches is not None and float(matches.confidence.mean()) > _ENOUGH_MATCHED:
         return False
 
     def confidence(views: Sequence[CameraView]) -> float:

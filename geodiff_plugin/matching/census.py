@@ -5,16 +5,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-#: Half the window: how far an image must reach beyond the pixels that are described.
+#: Half the window: the margin that an image needs around the pixels whose census is taken.
 MARGIN_PX = 3
-# 7 x 7 window, every second offset: this many a side.
+# Neighbours along a side of the window: every second one of 7.
 _SIDE = 4
 # A difference in brightness of this counts as certain; below it the vote is proportional, so that noise on
 # flat surfaces hardly votes.
 _CONTRAST = 6.0 / 255.0
 #: A certain vote; the largest for which a cost still fits into a byte.
 VOTE_LEVELS = 7
-#: The cost of two descriptions that differ in everything: 224.
+#: The cost of two descriptors that differ in everything: 224.
 COST_LEVELS = 2 * VOTE_LEVELS * _SIDE * _SIDE
 
 

@@ -1,7 +1,7 @@
 """Removal of JPEG blocks and sensor noise from photographs before they are compared.
 
 The filter is hard thresholding of a shifted 8 x 8 DCT (Coifman and Donoho 1995, "Translation-invariant
-de-noising"), the steps of the quantisation those of ITU-T T.81, table K.1.
+de-noising"); the quantisation table is K.1 of ITU-T T.81.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ _LUMA_STEPS = (
     *(49, 64, 78, 87, 103, 121, 120, 101),
     *(72, 92, 95, 98, 112, 100, 103, 99),
 )
-# Coefficients that even a strongly compressed picture keeps, and how many of them must tell the same step.
+# Coefficients that even strong compression keeps; how many must agree on the scale of the table, and to what.
 _KEPT = ((0, 1), (1, 0), (2, 0), (1, 1), (0, 2), (0, 3), (1, 2), (2, 1), (3, 0))
 _LEAST_VOTES, _ALIKE = 5, 0.3
-# Steps that are tried, and blocks that are looked at, at most.
+# Upper bounds on the quantisation steps that are tried and on the blocks that are read.
 _MOST_STEP, _MOST_BLOCKS = 100, 2048
-# As many values must be multiples of a step, and as well.
+# A step counts if at least so many values are multiples of it, and so closely (mean cosine).
 _LEAST_VALUES, _LEAST_FIT = 32, 0.5
 # A step of more grey levels than this between two pixels is the scene's, not the edge of a block.
 _MOST_BLOCK_EDGE = 8.0
 # Noise is read from the finest coefficients of the flattest tenth of the blocks, which contain less of it
 # than the others: the factor is that of normally distributed noise.
 _FLATTEST, _NOISE_OF_FLATTEST = 0.1, 1.0 / 0.77
-# Up to the first number of grey levels it does not disturb the comparison, and fine texture may be taken for
-# it; from the second on all is removed.
+# Noise below the first number of grey levels does not disturb the matching and may be fine texture; noise
+# above the second is removed in full.
 _NOISE_RANGE = (1.7, 2.8)
 # Coefficients below so many steps, or so many standard deviations of the noise, are not the scene's. On
 # rendered pairs wrong matches are as few from half to twice these.
 _STEPS, _DEVIATIONS = 1.2, 3.6
 # 16 of the 64 positions of the blocks, every row and column twice.
 _SHIFTS = tuple((i, (3 * i + k) % _BLOCK) for i in range(_BLOCK) for k in (0, _BLOCK // 2))
-# Shrinking averages a picture of more than so many times the pixels of the grid that it is compared on:
+# A picture with more than so many times the pixels of the matching grid is cleaned enough by shrinking;
 # 1280 x 960 still gains from cleaning.
 _SHRUNK = 6.0
 

@@ -8,30 +8,30 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.matching.aggregation import NEVER, PATHS, Room, aggregate
+from geodiff_plugin.matching.aggregation import NEVER, PATHS, Buffers, aggregate
 from geodiff_plugin.matching.alignment import AlignedView
 from geodiff_plugin.matching.census import COST_LEVELS
 from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.sweep import UNSEEN_LEVEL, CostVolume
 
-#: Planes of the truth within which a match counts as right.
+#: Distance from the truth, in planes, up to which a match counts as right.
 RIGHT_WITHIN_PLANES = 3.0
 #: Log-odds that a checked match is right, linear in its evidence, by logistic regression on pairs with truth
 #: (``python -m tests.benchmarks.confidence`` refits them).
 LOG_ODDS = (5.8, 0.8, -5.9, -0.62)
-#: Planes by which the matches of the two views may differ.
+#: Difference in planes up to which matches of the two views agree.
 AGREEMENT_PLANES = 1.5
-#: Half the window, px, over which a match's plane must be better than the mean plane, and by how much, as a
-#: share of the largest cost, for full confidence. Else aggregation would carry matches across blank walls.
+#: For full confidence a match's cost, averaged over a window of this half width in px, lies below the mean
+#: plane's by this share of the largest cost. Else aggregation would carry matches across blank walls.
 CONTRAST_REACH, LEAST_CONTRAST = 15, 0.03
-# The right view is matched in every such row only.
+# Only every second row of the right view is matched.
 _EVERY_ROW = 2
-# A sum over the paths and its plane in one integer, so that one minimum finds both.
+# Packs a sum over the paths and its plane into one integer, so that one minimum finds both.
 _PLANES = 1 << 12
 
 
 def _winner(total: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The best plane of sums ``(D, H, W)``, the position between planes, the planes around it, its sum."""
+    """The plane of least sum ``(D, H, W)``, its position between planes, its neighbours, and that sum."""
     keys = torch.full_like(total[0], NEVER, dtype=torch.int32).mul_(_PLANES)
     plane_keys = torch.empty_like(keys)
     for plane in range(len(total)):
@@ -45,21 +45,21 @@ def _winner(total: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return index, position, around, best
 
 
-def _right_winners(volume: CostVolume, view: AlignedView, room: Room) -> Tensor:
-    """The position between planes that a right view takes for the best, ``(ceil(h / 2), w)`` of its canvas.
+def _right_winners(volume: CostVolume, view: AlignedView, buffers: Buffers) -> Tensor:
+    """The winners of a right view, positions between planes, ``(ceil(h / 2), w)`` of its canvas.
 
-    Its costs are those of the same sweep, looked up along its own pixels and aggregated along its own edges.
+    The costs of the sweep are looked up for each pixel of the right view and aggregated along its edges.
     """
     height, width = volume.size
-    # One row and one column more: what a right view's pixel reads beside the left image.
+    # The extra row and column are read by pixels of the right view that the left image does not show.
     plane = volume.left_01.new_full((height + 1, width + 1), UNSEEN_LEVEL)
     rows, columns = view.sources(height, 1)[:, ::_EVERY_ROW], view.sources(width, 0)
     size = (rows.shape[1], columns.shape[1])
-    levels = room.cells("levels", len(volume.levels), size, volume.levels)
+    levels = buffers.empty("levels", len(volume.levels), size, volume.levels)
     for k, of_plane in enumerate(volume.levels):
         plane[:height, :width] = of_plane
         levels[k] = plane.index_select(0, rows[k]).index_select(1, columns[k])
-    return _winner(aggregate(levels, view.grey[::_EVERY_ROW], room=room))[1]
+    return _winner(aggregate(levels, view.grey[::_EVERY_ROW], buffers=buffers))[1]
 
 
 def _disagreement(view: AlignedView, other: Tensor, position: Tensor) -> Tensor:
@@ -90,7 +90,7 @@ def _disagreement(view: AlignedView, other: Tensor, position: Tensor) -> Tensor:
 
 
 def _contrast(volume: CostVolume, index: Tensor, reach: int) -> Tensor:
-    """How much better than the mean plane the chosen one is, before aggregation, averaged over a window."""
+    """By how much the chosen plane beats the mean plane before aggregation, averaged over a window."""
     total, seen = (torch.zeros_like(index, dtype=torch.int32) for _ in range(2))
     for levels, in_view in zip(volume.levels, volume.in_view, strict=True):
         total += levels
@@ -112,8 +112,8 @@ def candidates(volume: CostVolume, views: Sequence[AlignedView]) -> Candidates:
     The evidence ``(4, H, W)``, in which the log-odds of a match are linear, is 1, the logarithm of the margin
     to the best plane elsewhere, cost, and left-right difference; with it comes that difference in planes.
     """
-    room = Room()
-    total = aggregate(volume.levels, volume.left_01[0], room=room)
+    buffers = Buffers()
+    total = aggregate(volume.levels, volume.left_01[0], buffers=buffers)
     index, position, around, best = _winner(total)
     second = total.scatter_(0, around, NEVER).amin(dim=0)
     unit = 1.0 / (PATHS * COST_LEVELS)
@@ -121,7 +121,7 @@ def candidates(volume: CostVolume, views: Sequence[AlignedView]) -> Candidates:
 
     def evidence() -> Iterator[tuple[Tensor, Tensor]]:
         for view in views:
-            difference = _disagreement(view, _right_winners(volume, view, room), position)
+            difference = _disagreement(view, _right_winners(volume, view, buffers), position)
             differs = difference.clamp_max(AGREEMENT_PLANES)
             yield torch.stack([torch.ones_like(margin), (margin + 0.03).log(), cost, differs]), difference
 

@@ -1,4 +1,4 @@
-"""Inverse depth and confidence per pixel: of matches of the views, and of known points in the same form."""
+"""``Matches``: inverse depth and confidence per pixel, of matches between views or of known points."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ REGION = 0.08
 #: How far behind the prior a reflection lies: in spreads of the matches around the prior's log depth, and at
 #: least, in log depth. A prior that misses a whole wall would have it rejected at fewer spreads.
 SPREADS, LEAST_DISTANCE = 3.0, 0.2
-#: From there to this multiple of it, a match's weight falls to nothing.
+#: A match's weight falls to 0 between that distance and this multiple of it.
 MULTIPLE = 1.6
-#: Confidence above which a match counts in that spread, and the least spread that is assumed, in log depth.
+#: Matches above this confidence make the spread; least spread, in log depth.
 SPREAD_CONFIDENCE, SPREAD_FLOOR = 0.3, 0.05
-#: Share of the distances by which the spread is measured, and the normal distribution's quantile there: the
-#: median would not see that nearly half of the scene is on a wrong surface.
+#: The spread is this quantile of the distances over the normal distribution's: the median would miss that
+#: nearly half of the scene is on a wrong surface.
 SPREAD_SHARE, NORMAL_QUANTILE = 0.6, 0.8416
 #: About so many distances are sorted: torch's quantile takes no more than 16 million.
 MOST_SORTED = 1 << 22
@@ -66,7 +66,7 @@ class Matches:
         return replace(self, confidence=self.confidence * inside.view_as(self.confidence))
 
     def above(self, confidence: float) -> Tensor:
-        """Flat indices ``(P,)`` of one image's pixels of more confidence; counted once, as a device waits."""
+        """Flat indices ``(P,)`` of one image's pixels above a confidence, cached: a GPU is waited for."""
         if confidence not in self._above:
             self._above[confidence] = (self.confidence.flatten() > confidence).nonzero()[:, 0]
         return self._above[confidence]
@@ -79,8 +79,7 @@ def points_to_matches(
 
     ``points`` are ``(N, 3)`` metres in the left camera's frame, or ``(N, 4)`` with their confidence in (0,
     1]; or a map ``(H, W)`` of the image's ``size``, 0 where unknown, or ``(H, W, 2)`` with its confidence.
-    Where several fall on one pixel the nearest wins. ``InputError`` if no point is left, or a map is of
-    another size.
+    Of several points in a pixel the nearest wins. ``InputError`` if none is left, or for a map of other size.
     """
     weight = None
     if points.ndim == 2 and points.shape[1] in (3, 4):
@@ -119,7 +118,7 @@ def points_to_matches(
 
 
 def with_points(matches: Matches | None, points: Matches) -> Matches:
-    """Matches, or ``None``, with known points in their place: what the refinement follows.
+    """Matches, or ``None``, replaced by known points where there are any: the target of the refinement.
 
     The confidence of a point is the number of pixels that it stands for: few points then decide as much as
     many, and one that a poor prior contradicts is not taken for an outlier, as a match would be. A match
@@ -143,7 +142,7 @@ def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
     """The share ``(B, 1, H, W)`` that remains of each match, given the prior's first depth at its scale.
 
     One-sided: a reflection and what is seen through glass lie behind the surface, never before it. A prior
-    that is right to 5 % can name a reflection, a prior that errs by 30 % cannot.
+    that is right to 5 % can tell a reflection; a prior that errs by 30 % cannot.
     """
     weight = matches.confidence.float()
     behind = -(matches.inverse_depth * depth_m).clamp_min(1e-6).log().clamp(-LARGEST, LARGEST)

@@ -12,7 +12,7 @@ from torch import Tensor
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.types import CameraView
 
-#: Of the matcher: only what both views agree on, and no speckles.
+#: Parameters of OpenCV's matcher: keep what both views agree on, and drop speckles.
 PARAMETERS = {
     "blockSize": 5,
     "uniquenessRatio": 10,
@@ -20,13 +20,13 @@ PARAMETERS = {
     "speckleRange": 2,
     "disp12MaxDiff": 1,
 }
-#: Matches with a smaller shift, in pixels, say nothing of depth. Shares of the width that shifts reach at
-#: most.
+#: Shifts below the first number, in pixels, are too small to measure depth; none exceeds the second, as a
+#: share of the image's width.
 MIN_SHIFT_PX, MAX_SHIFT = 0.3, 0.3
 
 
 def make_matcher(lowest: int, count: int, channels: int) -> Any:
-    """OpenCV's matcher for disparities from ``lowest`` on, ``count`` of them, for so many colour channels."""
+    """OpenCV's matcher for ``count`` disparities from ``lowest`` on, of images with ``channels`` channels."""
     area = channels * PARAMETERS["blockSize"] ** 2
     return cv2.StereoSGBM.create(
         minDisparity=lowest,
@@ -39,7 +39,7 @@ def make_matcher(lowest: int, count: int, channels: int) -> Any:
 
 
 def pad_columns(image: np.ndarray, count: int) -> np.ndarray:
-    """An image with its first column repeated ``count`` times: OpenCV leaves so many columns empty."""
+    """An image with its first column repeated ``count`` times: OpenCV leaves that many columns empty."""
     pads = ((0, 0), (count, 0), (0, 0))[: image.ndim]
     return np.ascontiguousarray(np.pad(image, pads, mode="edge"))
 
@@ -47,9 +47,8 @@ def pad_columns(image: np.ndarray, count: int) -> np.ndarray:
 def fill_background(shift: np.ndarray) -> np.ndarray:
     """Fill holes with the farther of the two neighbours in the row, as KITTI's development kit does.
 
-    ``shift (H, W)`` is smaller for what is farther (pixels or 1/m), NaN in holes. At a row's ends the only
-    neighbour counts; an empty row copies the nearest filled one above, else below. All NaN where nothing is
-    known.
+    ``shift (H, W)`` (pixels or 1/m) falls with depth and is NaN in holes. At a row's ends the only neighbour
+    counts; an empty row copies the nearest filled one above, else below. NaN everywhere if all is unknown.
     """
     known = np.isfinite(shift)
     columns = np.arange(shift.shape[1])[None]
@@ -70,7 +69,7 @@ def match_rows(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Match a rectified pair of one size, ``left_01 (3, H, W)`` in [0, 1] and ``view`` on either side.
 
-    ``nearest_px`` is the largest shift that is looked for.
+    ``nearest_px`` is the largest shift of the search.
 
     Returns:
         Three ``(H, W)``: the shift in pixels from where the point would be at infinity; 1 where both views
@@ -79,7 +78,7 @@ def match_rows(
     images = [(grey(image) * 255.0).round().byte()[0].cpu().numpy() for image in (left_01, view.image_01)]
     infinity = float(K_left[0, 2] - view.K[0, 2])
     mirrored = float(view.T_right_from_left[0, 3]) > 0
-    if mirrored:  # a view to the left is one to the right in a mirror
+    if mirrored:  # mirrored, a view to the left becomes one to the right
         images, infinity = [image[:, ::-1] for image in images], -infinity
     width = images[0].shape[1]
     lowest = int(np.floor(infinity))

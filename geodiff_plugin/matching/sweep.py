@@ -12,12 +12,12 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.geometry import NEAREST_M, PlaneRays, image_size, is_rectified, plane_rays
-from geodiff_plugin.matching.aggregation import cells
+from geodiff_plugin.matching.aggregation import empty_volume
 from geodiff_plugin.matching.alignment import AlignedView, ComparedView, align_view
 from geodiff_plugin.matching.census import COST_LEVELS, MARGIN_PX, census, grey_levels
 from geodiff_plugin.types import CameraView
 
-#: Cost of a plane on which no right view sees the pixel: that of unrelated texture, neither good nor bad.
+#: Cost where no right view sees the pixel on a plane: that of unrelated texture, neither good nor bad.
 UNSEEN_LEVEL = 78
 _LEAST_SHIFT_PX = 0.3
 
@@ -35,7 +35,7 @@ class CostVolume:
     inverse_depth: Tensor  # (D,) float32, 1/m, ascending and evenly spaced
     K: Tensor  # (3, 3) pixels of this grid
     left_01: Tensor  # (1, H, W) grey left image on this grid
-    rights: tuple[CameraView, ...]  # at the resolution that was used, grey
+    rights: tuple[CameraView, ...]  # grey, at the resolution of the sweep
     aligned: tuple[AlignedView, ...]  # the same, turned parallel to the left view
 
     @property
@@ -65,7 +65,7 @@ class CostVolume:
 
     @cached_property
     def reach_m(self) -> tuple[float, float]:
-        """Metres of the nearest plane, and of a shift of 0.3 px, beyond which views say nothing."""
+        """Metres of the nearest plane, and of a shift of 0.3 px, beyond which depth cannot be measured."""
         all_rays = [plane_rays(self.K[None], K[None], T[None], self.size) for _, K, T in self.rights]
         farthest = max(1.0 / float(inverse_depth_at_shift(rays, _LEAST_SHIFT_PX)) for rays in all_rays)
         return 1.0 / float(self.inverse_depth[-1]), farthest
@@ -92,7 +92,7 @@ def median_shift(rays: PlaneRays, inverse_depth: Tensor, name: str = "E") -> Ten
         bad_value(name, "a pose under which the views overlap", "a right camera that looks the other way")
     uv, in_front = _plane_uv(some, inverse_depth)
     dx, dy = (uv - at_infinity).unbind(dim=1)
-    shift = torch.hypot(dx, dy)  # a norm over a dimension of 2 takes most of a sweep's time
+    shift = torch.hypot(dx, dy)  # torch's norm over a dimension of 2 would take most of a sweep's time
     shift = torch.where(in_front, shift, torch.full_like(shift, torch.inf))
     return shift[:, ahead[0]].median(dim=1).values
 
@@ -100,9 +100,8 @@ def median_shift(rays: PlaneRays, inverse_depth: Tensor, name: str = "E") -> Ten
 def inverse_depth_at_shift(rays: PlaneRays, shift_px: float, name: str = "E") -> Tensor:
     """The inverse depth, ``()`` 1/m within 1 %, at which ``median_shift`` reaches ``shift_px`` > 0.
 
-    A camera that stands behind the other one sees no pixel move further than to the epipole: there, at most
-    the depth at which it has gone half of that way. ``InputError`` also where both cameras stand at one
-    place.
+    If one camera stands behind the other, pixels move to the epipole at most, so ``shift_px`` is bounded by
+    half of that way. ``InputError`` also where both cameras stand at one place.
     """
     exponents = rays.A.new_tensor([-8.0, 5.0])
     most = float(median_shift(rays, 10.0 ** exponents[1:], name))
@@ -124,15 +123,15 @@ def sweep_planes(
 ) -> CostVolume:
     """Compare the left view ``(1, H, W)``, grey in [0, 1], with the right views on every plane.
 
-    All are used at the resolution as given, the right ones at about as many pixels per radian; their costs
-    are averaged over those that see a pixel. ``inverse_depth (D,)`` 1/m is ascending and even, D >= 2. Planes
-    go one by one, so memory is that of the result, two bytes a cell.
+    Images keep their resolution; the right ones should have about as many pixels per radian. A cost is the
+    mean over the views that see the pixel. ``inverse_depth (D,)`` 1/m is ascending and even, D >= 2. Planes
+    are computed one by one, so memory is that of the result, two bytes per pixel and plane.
     """
     size = image_size(left_01)
     aligned = tuple(align_view(right, K_left, size, inverse_depth) for right in rights)
     left = census(grey_levels(F.pad(left_01[None], (MARGIN_PX,) * 4, mode="replicate")[0, 0]))
     compared = [ComparedView(left, view) for view in aligned]
-    levels = cells(len(inverse_depth), size, torch.uint8, left.device)
+    levels = empty_volume(len(inverse_depth), size, torch.uint8, left.device)
     in_view = left.new_empty(levels.shape, dtype=torch.bool)
     unseen = levels.new_full((), UNSEEN_LEVEL)
     for plane in range(len(inverse_depth)):

@@ -17,35 +17,35 @@ from geodiff_plugin.types import CameraView
 #: Standard deviation of a good match, pixels of the left image.
 MATCH_NOISE_PX = 0.25
 
-#: What confidence is the probability of: a relative error below this.
+#: Confidence is the probability of a relative error below this.
 RIGHT_WITHIN = 0.1
 #: Log-odds, by logistic regression on pairs with truth, every pair weighing the same
-#: (``python -m tests.benchmarks.confidence`` refits them): constant, by certainty, by the prior's
-#: strength, by photometric agreement, by the relative spread of an ensemble (set by hand: members that differ
-#: by 10 % halve the odds twice).
+#: (``python -m tests.benchmarks.confidence`` refits them): constant, certainty, strength of the prior,
+#: photometric agreement, and relative spread of the ensemble (set by hand: members that differ by 10 % halve
+#: the odds twice).
 BY_EVIDENCE = (-0.228, 0.788, 2.42, 0.0864, -15.0)
-# Beyond these photometric errors tell nothing more, nor do errors of the prior as a whole, nor that which is
-# left to a depth: where it is largest many depths are right all the same.
+# Bounds outside which these make no difference: the photometric error, the error of the prior, and the error
+# that remains in a depth (where it is largest, many depths are correct all the same).
 _LEAST_DIFFERENCE, _MOST_DIFFERENCE = 0.01, 0.1
 _STRONG, _WEAK = 0.03, 0.15
 _LEAST_LEFT, _MOST_LEFT = 0.0005, 0.05
-# Errors of the prior in log depth: of the best that matches can tell, of one that is of no use.
+# Errors in log depth: of the best prior that matches can tell apart, and of a useless one.
 _BEST, _USELESS = 0.01, 0.5
-# Support at which the prior's error is half known: it is measured where matches are, and a prior that is
-# right on the street may be wrong on the trees above it.
+# Support at which the prior's error is half known: it is measured where there are matches, and a prior that
+# is right on the street may be wrong on the trees above it.
 _HALF_KNOWN = 0.1
 
 
 def depth_evidence(
     support: Tensor, error: Tensor, visible: Tensor, spread: Tensor | None, prior_error: Tensor | None = None
 ) -> Tensor:
-    """What the log-odds of ``depth_confidence``, whose arguments these are, are linear in: ``(B, 5, H, W)``.
+    """Features ``(B, 5, H, W)`` of the logistic model in ``depth_confidence``, whose arguments these are.
 
-    1, certainty, strength, agreement, spread. The measured error of the prior counts only as far as the pixel
-    has support; without any the prior counts as useless. Certainty is the log of .05 over what is left of
-    that error, ``(1 - support) * error``, strength that of .15 over it: with a good prior wrong matches lose
-    their weight, a poor one follows them. Agreement is how far the log of the photometric error lies below
-    that of .1.
+    They are 1, certainty, strength, agreement and spread. The less support a pixel has, the more its error of
+    the prior goes from the measured one to that of a useless prior. Certainty is the log of .05 over the
+    remaining error, ``(1 - support) * error``; strength is the log of .15 over ``error``, because wrong
+    matches lose their weight with a good prior, while a poor one follows them. Agreement is the log of .1
+    over the photometric error.
     """
     agreement = -(error.clamp(_LEAST_DIFFERENCE, _MOST_DIFFERENCE) / _MOST_DIFFERENCE).log()
     measured = support.new_tensor(_USELESS) if prior_error is None else prior_error.clamp(_BEST, _USELESS)
@@ -67,15 +67,15 @@ def depth_confidence(
 ) -> Tensor:
     """Probability ``(B, 1, H, W)`` that a depth is within 10 % of the truth.
 
-    By the support of ``refine_depth``, the photometric error, the relative spread of an ensemble's members,
-    and a ``local_error`` of the prior on any grid, which counts as useless where it is ``None``.
+    From the support of ``refine_depth``, the photometric error, the relative spread of an ensemble's members
+    (or ``None``), and the prior's ``local_error`` on any grid (``None`` counts as a useless prior).
     """
     weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
     confidence = torch.empty_like(support)
     size = image_size(support)
     if prior_error is not None and image_size(prior_error) != (1, 1):
         prior_error = F.interpolate(prior_error, size, mode="nearest-exact")
-    for rows in row_strips(*size):  # evidence is five times as large as what it says
+    for rows in row_strips(*size):  # the features take five times as much memory as the result
         shown = [x[:, :, rows] for x in (support, error, visible)]
         further = (None if x is None else x.expand_as(support)[:, :, rows] for x in (spread, prior_error))
         evidence = depth_evidence(*shown, *further)
@@ -84,10 +84,10 @@ def depth_confidence(
 
 
 def expected_error(depth_m: np.ndarray, K_left: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarray:
-    """What the geometry alone lets a matched depth be off, ``(H, W)`` metres: ``z^2 sigma_d / (f b)``.
+    """Standard error of a matched depth by geometry alone, ``(H, W)`` metres: ``z^2 sigma_d / (f b)``.
 
-    Of any pose ``(z - t_z)^2 sigma_d / |f (t_xy - r_xy t_z)|`` by the pixel's ray ``r`` and the right
-    camera's centre ``t``, the best of ``poses (4, 4)``; its rotation moves no point relative to another.
+    For a general pose ``(z - t_z)^2 sigma_d / |f (t_xy - r_xy t_z)|``, with the pixel's ray ``r`` and the
+    right camera's centre ``t``; the least over ``poses (4, 4)``. Rotations do not change it.
     """
     rows, columns = np.indices(depth_m.shape)
     rays = (columns - K_left[0, 2]) / K_left[0, 0], (rows - K_left[1, 2]) / K_left[1, 1]
@@ -102,7 +102,7 @@ def expected_error(depth_m: np.ndarray, K_left: np.ndarray, poses: Sequence[np.n
 def reprojection(
     views: Sequence[CameraView], depth_m: Tensor, left_01: Tensor, K_left: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Where any native right view sees the pixel, and the least error to the re-rendered left image.
+    """Where any native right view sees the pixel, and the least photometric error of the re-rendered image.
 
     ``(1, 1, H, W)`` bool and float in [0, 1], in the left image's exposure, 0 where no view sees the pixel.
     """

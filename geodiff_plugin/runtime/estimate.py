@@ -1,6 +1,6 @@
-"""The prior's estimate at one denoising step: clean latent, relative map, and the way between the two.
+"""The prior's estimate at one denoising step: clean latent and relative map, decoded and encoded.
 
-Maps cover the pixels of the image, latents the padded processing grid.
+Maps cover the image on the processing grid, latents also its padding.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from geodiff_plugin.runtime.hooks import DenoiserTap, put_channels
 #: What the scheduler's step is given: network output, noisy latent, and what to add to its result.
 StepInputs = tuple[Tensor, Tensor, Tensor | None]
 
-#: Values of ``decoder`` that are no folder and no hub id.
+#: Values of the knob ``decoder`` that are neither a folder nor a hub id.
 FULL, TINY = "full", "tiny"
-#: Channels, pixels a cell and scaling factor of a latent -> hub id of the tiny autoencoder that knows it.
+#: Channels, pixels per cell and scaling factor of a latent -> hub id of the tiny autoencoder for it.
 KNOWN: dict[tuple[Any, ...], str] = {
     (4, 8, 0.18215): "madebyollin/taesd",
     (4, 8, 0.13025): "madebyollin/taesdxl",
@@ -39,7 +39,7 @@ KNOWN: dict[tuple[Any, ...], str] = {
 
 @dataclass(frozen=True)
 class ProcessingGrid:
-    """The grid that a pipeline denoises on: ``(H, W)`` of the image, and rows and columns that pad it."""
+    """The grid that a pipeline denoises on: ``(H, W)`` of the image, and rows and columns of padding."""
 
     content: tuple[int, int]
     padding: tuple[int, int]
@@ -55,7 +55,7 @@ class ProcessingGrid:
         return x[:, :, :height, :width]
 
     def padded(self, x: Tensor) -> Tensor:
-        """A map on the whole grid, also one of whole cells only: its last row and column repeat."""
+        """A map, also one that covers whole cells only, extended to the grid by its last row and column."""
         bottom, right = (full - side for full, side in zip(self.size, x.shape[-2:], strict=True))
         return F.pad(x, (0, right, 0, bottom), mode="replicate") if bottom or right else x
 
@@ -80,10 +80,10 @@ class MapCodec:
     def decode(self, z0: Tensor, final: bool = False) -> Tensor:
         """Unclipped relative map ``(B, 1, H, W)`` float32 of a clean latent's depth channels, differentiable.
 
-        A ``final`` map, a result, is decoded by the pipeline's autoencoder.
+        A ``final`` map is the result, so the pipeline's autoencoder decodes it and not the tiny one.
         """
         with self._autoencoder(None if final else self.tiny):
-            x = self.prior.decode(z0).float()  # of a prior in float64 as well: the views are in float32
+            x = self.prior.decode(z0).float()  # float32 even for a prior in float64, as the views are
         return self.grid.cropped(self.grid.padded(x))
 
     def encode(self, x: Tensor) -> Tensor:
@@ -93,7 +93,7 @@ class MapCodec:
 
 
 def _latent_of(vae: Any) -> tuple[int | None, int | None]:
-    """Channels of an autoencoder's latent, and pixels a cell; ``None`` where it does not say."""
+    """Channels of an autoencoder's latent, and pixels per cell; ``None`` if its config has none."""
     config = vae.config
     stages = config.get("decoder_block_out_channels") or config.get("block_out_channels")
     return config.get("latent_channels", config.get("z_dim")), 2 ** (len(stages) - 1) if stages else None
@@ -107,7 +107,7 @@ def tiny_autoencoder(pipe: Any, decoder: str) -> AutoencoderTiny | None:
     channels, cell = (None, None) if vae is None else _latent_of(vae)
     cure, known = "", None if vae is None else KNOWN.get((channels, cell, vae.config.get("scaling_factor")))
     if cell is None:
-        cure = "It has no latent of a single image: it works on pixels, or its autoencoder is one of videos."
+        cure = "It has no latent of a single image: it works on pixels, or its autoencoder is for videos."
     elif decoder == TINY and known is None:
         cure = f"None is published for its latent of {channels} channels; give a folder or a hub id of one."
     if cure:
@@ -132,10 +132,11 @@ def _loaded(name: str, dtype: torch.dtype, device: str) -> AutoencoderTiny:
 
 
 class StepEstimate:
-    """One denoising step's estimate, as ``algorithm.step`` guides it.
+    """The ``algorithm.step.Estimate`` of one denoising step.
 
-    Of the network's output and z_t, ``(B, C, h, w)`` each, all channels, in the pipeline's precision. Without
-    a ``tap`` guidance moves the clean latent. Unless ``latent_is_read`` a last map needs no code.
+    Made from the network's ``output`` and ``z_t``, ``(B, C, h, w)`` each with all channels, in the pipeline's
+    precision. Guidance moves z_t if there is a ``tap``, else the clean latent. ``latent_is_read`` is false if
+    only the map is needed after this step.
 
     Attributes:
         latent: ``(B, c, h, w)`` float32, what guidance moves: z_t ("full") or z0_hat ("denoised").
@@ -160,28 +161,28 @@ class StepEstimate:
         self.encode, self.latent_is_read = codec.encode, latent_is_read
 
     def z0(self, latent: Tensor) -> Tensor:
-        """The clean latent of a guided one: Tweedie with the network's graph in "full", else the same."""
+        """The clean latent of ``latent``: Tweedie through the network ("full"), or the identity."""
         if self._tap is None:
             return latent
         output = self._tap.output_at(latent)[:, self._codec.prior.depth_channels].to(self._wide)
         return z0_from(output, latent, self._level)
 
     def decode(self, z0: Tensor, final: bool = False) -> Tensor:
-        """As ``MapCodec.decode``; a ``final`` map is given out, unless its latent is read."""
+        """As ``MapCodec.decode``; a ``final`` map is the result, unless the latent is read."""
         return self._codec.decode(z0, final and not self.latent_is_read)
 
     def step_inputs(self, move: Tensor, from_moved: bool) -> StepInputs:
-        """What the scheduler's own step is given once guidance adds ``move (B, c, h, w)`` to the latent.
+        """Inputs of the scheduler's step after guidance changes the latent by ``move (B, c, h, w)``.
 
-        With the full gradient and ``from_moved`` the step starts from the moved z_t; else the move is added
-        to its result.
+        With the full gradient and ``from_moved`` the step starts from the moved z_t; without ``from_moved``
+        the move is added to the step's result.
         """
         moved, prior = (self.latent + move).detach(), self._codec.prior
         if self._tap is None:
             output, z_t = output_from(moved, self.eps, self._level)
             return self._put(self._output, output), self._put(self._z_t, z_t), None
         if prior.max_steps == 1:
-            # The step gives the clean latent: the network's answer at the moved z_t, not a moved answer.
+            # The step returns the clean latent: evaluate the network at the moved z_t.
             return self._tap.output_at(moved).detach(), self._put(self._z_t, moved), None
         if from_moved:
             return self._output, self._put(self._z_t, moved), None

@@ -1,7 +1,7 @@
-"""All that a guided call changes on a live pipeline, and puts back: scheduler, network, weights.
+"""What a guided call changes on a live pipeline, and restores: scheduler, network, ``requires_grad``.
 
-Each context manager undoes itself at exit, and may be entered again: while a callback runs the pipeline is as
-the user left it. The guided ``step`` is the DDIM line of Algorithm 1.
+Each context manager restores the pipeline at exit and can be entered again: while a callback runs the
+pipeline is as the user left it. The guided ``step`` is the DDIM line of Algorithm 1.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def put_channels(whole: Tensor, channels: slice, part: Tensor) -> Tensor:
 
 @contextmanager
 def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """Hide a class's attribute by one of the instance ``owner``; then put back what was there."""
+    """Set an attribute of the instance ``owner``, and restore it at exit."""
     before = vars(owner).get(name)
     setattr(owner, name, value)
     try:
@@ -48,7 +48,7 @@ def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
 
 @contextmanager
 def frozen_weights(pipe: Any) -> Iterator[None]:
-    """``requires_grad`` off on every weight of a pipeline; otherwise each of them would keep a graph."""
+    """Switch ``requires_grad`` off for every weight of a pipeline, so that no graph is kept for them."""
     flags = [(p, p.requires_grad) for module in networks_of(pipe) for p in module.parameters()]
     for parameter, _ in flags:
         parameter.requires_grad_(False)
@@ -65,7 +65,7 @@ def networks_of(pipe: Any) -> list[torch.nn.Module]:
 
 
 def images_in_float32(processor: Any) -> AbstractContextManager[None]:
-    """An image processor reads and resizes in float32: float16 has no white of a 16-bit image."""
+    """Let an image processor work in float32: float16 cannot hold the white of a 16-bit image, 65535."""
     stock = processor.preprocess
 
     def preprocess(
@@ -82,7 +82,7 @@ def images_in_float32(processor: Any) -> AbstractContextManager[None]:
 
 
 class Exclusive:
-    """What a call holds against other threads: its pipeline; a guided one also networks, and the cores."""
+    """Locks of a call: on its pipeline, and of a guided call also on the networks and the CPU threads."""
 
     def __init__(self, pipe: Any, guided: bool) -> None:
         owners = [pipe, *networks_of(pipe)] if guided else [pipe]
@@ -105,7 +105,7 @@ class Exclusive:
 
     @contextmanager
     def given_back(self) -> Iterator[None]:
-        """Release everything for a while, and wait for the locks afterwards."""
+        """Release all locks inside the context, and wait for them at its end."""
         self.__exit__()
         try:
             yield
@@ -114,22 +114,22 @@ class Exclusive:
 
 
 class DenoiserTap:
-    """Runs the network with gradients to its depth latent, and again at another latent.
+    """Runs the network with gradients to its depth latent, and can rerun it at another latent.
 
-    An attribute of the instance ``owner`` hides its class's ``method``, so that hooks and compiled forwards
-    below are called as before. ``channels`` of the method's first argument are the depth latent.
+    An attribute of the instance ``owner`` overrides its ``method`` and calls it, so hooks and compiled
+    forwards still run. ``channels`` of the method's first argument are the depth latent.
     Source: the gradient to z_t in Algorithm 1 and Eq. 15 (eq:final_score).
     """
 
     def __init__(self, owner: Any, method: str, channels: slice) -> None:
         self._owner, self._method, self._channels = owner, method, channels
-        self._at: Callable[[Tensor], Any] | None = None  # the latest call, at another latent
+        self._at: Callable[[Tensor], Any] | None = None  # repeats the latest call at another latent
         self._leaf: Tensor | None = None
         self._output: Tensor | None = None
 
     @contextmanager
     def attached(self) -> Iterator[None]:
-        """The method is tapped inside; afterwards it is as it was and the graph is dropped."""
+        """Override the method; at exit restore it and drop the graph."""
         stock, thread = getattr(self._owner, self._method), threading.get_ident()
 
         @functools.wraps(stock)
@@ -151,11 +151,11 @@ class DenoiserTap:
         return self._leaf
 
     def release(self) -> None:
-        """Drop the graph and all that it holds."""
+        """Drop the graph."""
         self._at = self._leaf = self._output = None
 
     def _run(self, forward: Callable[..., Any], model_input: Tensor, *args: Any, **kwargs: Any) -> Any:
-        """The tapped call: same result, detached; the graph is kept until ``release``."""
+        """Call the network: same result, detached; the graph is kept until ``release``."""
         model_input = model_input.detach()
         wide = torch.promote_types(model_input.dtype, torch.float32)
         kind = model_input.device.type
@@ -178,7 +178,7 @@ class DenoiserTap:
     def output_at(self, z_t: Tensor) -> Tensor:
         """Network output with its graph to ``z_t (B, C, h, w)`` float32.
 
-        The pipeline's own forward is reused for its own input: one update costs no second network call.
+        At the latent of the latest call that call's output is reused: the first update costs no second call.
         """
         assert self._at is not None and self._output is not None
         return self._output if z_t is self._leaf else _first(self._at(z_t))
@@ -192,13 +192,13 @@ def _first(result: Any) -> Tensor:
 class GuidedScheduler:
     """A copy of the scheduler: ``set_timesteps`` starts a trajectory, ``step`` is guided.
 
-    So a pipeline that shares the scheduler never meets a guided ``step``, and the user's keeps its state. A
-    scheduler of which the user replaced a method on the instance is used itself, since the method usually
-    holds on to it; all its attributes are put back. ``step`` gets the timesteps on the CPU, where diffusers
-    keeps the tables that they index: looked up on another device, each would be waited for.
+    So other pipelines with the same scheduler are not guided, and the user's scheduler keeps its state. If
+    the user replaced a method on the instance, that scheduler is used instead of a copy, because the method
+    usually refers to it; all its attributes are restored. ``step`` gets its timesteps on the CPU, where
+    diffusers keeps the tables that they index: a lookup on another device would wait for it.
 
-    ``run`` is a ``GuidedRun``, whose ``guide`` gives what the scheduler's own step takes, and what to add to
-    its ``z_{t-1}``; ``respace`` runs a leading DDIM as trailing, whose first ``skipped`` steps are left out.
+    ``run`` is a ``GuidedRun``, whose ``guide`` gives the inputs of the stock step and what to add to its
+    ``z_{t-1}``; ``respace`` runs a leading DDIM as trailing; the first ``skipped`` steps are left out.
     """
 
     def __init__(self, pipe: Any, run: Any, respace: bool, skipped: int) -> None:
@@ -210,7 +210,7 @@ class GuidedScheduler:
 
     @contextmanager
     def attached(self) -> Iterator[None]:
-        """The guided scheduler is on the pipeline; entered again in mid-call, its trajectory goes on."""
+        """Put the guided scheduler on the pipeline; entered again during a call it continues."""
         original, outside = self._pipe.scheduler, vars(self._scheduler)
         self._scheduler.__dict__ = self._inside
         # Past ``DiffusionPipeline.__setattr__``, which would rewrite the pipeline's config.
@@ -222,11 +222,11 @@ class GuidedScheduler:
             object.__setattr__(self._pipe, "scheduler", original)
 
     def release(self) -> None:
-        """Let go of the call, after its end: the wrapped methods and this object hold each other."""
+        """Break the reference cycle between this object and the wrapped methods after a call."""
         self._inside, self._run = {}, None
 
     def _wrapped(self) -> dict[str, Callable[..., Any]]:
-        """The two methods as instance attributes, which hide those of the class."""
+        """The two guided methods, as instance attributes that override those of the class."""
         scheduler = self._scheduler
         stock_set_timesteps, stock_step = scheduler.set_timesteps, scheduler.step
 
@@ -238,19 +238,19 @@ class GuidedScheduler:
             self._timesteps = (scheduler.timesteps if trailing is None else trailing).cpu()[self._skipped :]
             self._done = 0
             self._run.begin(self._timesteps)
-            scheduler.timesteps = self._timesteps.to(device=device)  # what the host's loop is about to take
+            scheduler.timesteps = self._timesteps.to(device=device)  # which the pipeline's loop iterates over
 
         @functools.wraps(stock_step)
         def step(model_output: Tensor, timestep: Any, sample: Tensor, *args: Any, **kwargs: Any) -> Any:
             given = timestep
             scheduler.timesteps, timestep = self._timesteps, self._timesteps[self._done]
             self._done += 1
-            output, z_t, shift = self._run.guide(model_output, timestep, sample)
+            output, z_t, move = self._run.guide(model_output, timestep, sample)
             result = stock_step(output, timestep, z_t, *args, **kwargs)
             is_tuple = isinstance(result, tuple)
             previous = result[0] if is_tuple else result.prev_sample
-            if shift is not None:
-                previous = (previous.float() + shift).to(previous.dtype)
+            if move is not None:
+                previous = (previous.float() + move).to(previous.dtype)
             previous = self._run.after_step(torch.as_tensor(given, device=previous.device), previous)
             if is_tuple:
                 return (previous, *result[1:])

@@ -1,4 +1,4 @@
-"""Noise level of a live scheduler at a timestep, one function per family; a new one is a line there."""
+"""Noise level of a live scheduler at a timestep: one function per family, in ``FAMILIES``."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ FAMILIES: dict[type, Callable[[Any, Tensor], NoiseLevel]] = {
 
 
 def noise_level(scheduler: Any, timestep: Tensor) -> NoiseLevel:
-    """Signal and noise level that the scheduler's next ``step`` assumes, at a 0-d ``timestep`` of its own."""
+    """Signal and noise level that the scheduler's next ``step`` assumes at its 0-d ``timestep``."""
     return _family(scheduler)(scheduler, timestep)
 
 
@@ -83,7 +83,7 @@ def check_scheduler(scheduler: Any) -> None:
     if getattr(config, "rescale_betas_zero_snr", False) and config.prediction_type == "epsilon":
         expected = "able to tell the clean latent from the network's output at every step"
         got = f"{name} with prediction_type='epsilon' and rescale_betas_zero_snr=True"
-        cure = "With no signal left a noise prediction says nothing; set rescale_betas_zero_snr=False or use "
+        cure = "Noise alone determines no clean latent; set rescale_betas_zero_snr=False or use "
         bad_value("pipe.scheduler", expected, got, cure + "v_prediction.")
     if getattr(config, "thresholding", False):
         expected = "without dynamic thresholding, which is for pixels and not for latents"
@@ -94,8 +94,8 @@ def check_scheduler(scheduler: Any) -> None:
 def trailing_timesteps(scheduler: Any, num_inference_steps: int) -> Tensor | None:
     """Timesteps of the same schedule with trailing spacing, for a DDIM that is ``leading``; else ``None``.
 
-    A leading schedule never visits t = 999 and starts from pure noise at a level that is none: with one step
-    it runs at t = 1.
+    A leading schedule never visits t = 999: it takes pure noise for that of a lower level; with one step it
+    runs at t = 1.
     """
     if not isinstance(scheduler, DDIMScheduler) or scheduler.config.timestep_spacing != "leading":
         return None

@@ -1,4 +1,4 @@
-"""From decoded maps to ``MetricDepthOutput``: ensembles (S5.1), maps finished, confidence, verdict."""
+"""From decoded maps to ``MetricDepthOutput``: ensemble (S5.1), refinement, confidence, verdict."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from geodiff_plugin.runtime.verdict import Indicators, Verdict, judge, points_ag
 from geodiff_plugin.scale.points import order_agreement
 from geodiff_plugin.types import MetricDepthOutput
 
-#: A visible share below this is reported to the user: the scale then rests on few pixels.
+#: The user is warned if the visible share is below this: few pixels then determine the scale.
 LITTLE_OVERLAP = 0.3
-#: Metres; what a metric prior may say of its nearest pixel is 0.
+#: Least depth of a metric prior, metres: its nearest pixel may be 0.
 LEAST_M = 1e-6
 
 
 def _finish(
     run: GuidedRun, image: int, depth_m: Tensor, left: Tensor, member: int | None = None
 ) -> tuple[Tensor, Tensor] | None:
-    """The result of a decoded map of an image or a member, ``(1, 1, H, W)`` metres, and its support.
+    """The refined map of an image or a member, ``(1, 1, H, W)`` metres, and its support.
 
-    Ramps first: a fit that finds edges steep does not carry the depth of a surface over to the next one.
-    ``None`` where there are neither matches nor points.
+    Edges are sharpened first: then the fit does not carry the depth of one surface over to the next.
+    ``None`` if there are neither matches nor points.
     """
     evidence, (kept, error) = run.evidence[image], run.kept_and_error(image, member)
     matches, points = Matches.stack([evidence.matches]), Matches.stack([evidence.points])
@@ -56,13 +56,13 @@ def _finish(
         target = correction_target(matches, points, kept, error, fitted_m)
         assert target is not None  # there are matches
         K = resize_intrinsics(evidence.K_left[None], image_size(evidence.left_01), image_size(native))[0]
-        measured = error.amin((2, 3), keepdim=True)  # where the prior says something
+        measured = error.amin((2, 3), keepdim=True)  # its value where the prior gives a depth
         fitted_m = vote_depth(fitted_m, native, K, evidence.native_views, target, measured)
     return fitted_m, support
 
 
 def _finish_images(run: GuidedRun, depth_m: Tensor, lefts: Tensor) -> tuple[Tensor, Tensor | None]:
-    """The result ``(N, 1, H, W)`` of every image, and its support; as it was where one has no matches."""
+    """Refined maps ``(N, 1, H, W)`` and their support; maps unchanged, and ``None``, if one has no target."""
     results = []
     for i, (depth, left) in enumerate(zip(depth_m.split(1), lefts.split(1), strict=True)):
         result = _finish(run, i, depth, left) if run.config.crisp else None
@@ -74,13 +74,13 @@ def _finish_images(run: GuidedRun, depth_m: Tensor, lefts: Tensor) -> tuple[Tens
 
 
 def _spread_of_members(run: GuidedRun, depth_m: Tensor, lefts: Tensor, call: Mapping[str, Any]) -> Tensor:
-    """How far the members of every ensemble, finished one by one, lie from its result: ``(N, 1, H, W)`` m."""
+    """Spread of the members of every ensemble, each refined, around its result: ``(N, 1, H, W)`` metres."""
     size, method = image_size(depth_m), call["resample_method_output"]
     reduction = (call["ensembling_kwargs"] or {}).get("reduction", "median")
     spreads = []
     for i, members in enumerate(run.members):
         members = members.float().to(depth_m.device)
-        if image_size(members) != size:  # as the stock call brings the ensemble to its output
+        if image_size(members) != size:  # resized as the stock call resizes the ensemble
             members = MarigoldImageProcessor.resize_antialias(members, size, method, is_aa=False)
             members = run.within_range(members, i)
         results = [_finish(run, i, member, lefts[i : i + 1], m) for m, member in enumerate(members.split(1))]
@@ -124,15 +124,15 @@ def assemble_output(
     call: Mapping[str, Any],
     warned: Mapping[str, bool],
 ) -> MetricDepthOutput:
-    """Everything of ``MetricDepthOutput`` but ``latent``, of the stock call's output, tensors in metres.
+    """``MetricDepthOutput`` without ``latent``, from the stock call's output, whose maps are in metres.
 
-    ``warned`` has the warnings so far, and whether each forbids trust.
+    ``warned`` has the warnings so far, and whether each of them makes the result untrusted.
     """
     natives = [evidence.native_left for evidence in run.evidence]
     # A single large picture is not copied.
     lefts_01 = natives[0][None] if len(natives) == 1 else torch.stack(natives)
     count, size, has_unit = len(natives), image_size(lefts_01), guidance.unit is not None
-    depth_m = run.within_range(stock.prediction.float().to(lefts_01.device))  # or the processing grid
+    depth_m = run.within_range(stock.prediction.float().to(lefts_01.device))  # or the grid's size
     grid = image_size(depth_m)
     lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
     depth_m, support = _finish_images(run, depth_m, lefts)
@@ -142,7 +142,7 @@ def assemble_output(
     Ks = torch.stack([torch.as_tensor(i.K_left, device="cpu").float() for i in guidance.inputs]).to(depth_m)
     K = resize_intrinsics(Ks, size, grid)
     visible, error = _reprojected(run, depth_m, lefts, K)
-    prior_error = run.prior_error()  # (N, 1, 1, 1), or of every pixel with the measured one as the least
+    prior_error = run.prior_error()  # (N, 1, 1, 1), or per pixel: the measured error where valid
     confidence, over_prior = None, _over_prior(run, depth_m)
     if support is not None:
         unseen = torch.zeros_like(depth_m)
@@ -152,9 +152,9 @@ def assemble_output(
     relative = torch.cat(run.relative)
     relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
     doubts = tuple(sentence for sentence, forbids in warned.items() if forbids)
-    told: dict[str, Any] = {"doubts": doubts, "has_unit": has_unit}
+    known: dict[str, Any] = {"doubts": doubts, "has_unit": has_unit}
     maps = relative, confidence, over_prior if has_unit else None
-    verdicts = [judge(_indicators(run, i, K, depth_m[i], *maps, **told)) for i, K in enumerate(Ks)]
+    verdicts = [judge(_indicators(run, i, K, depth_m[i], *maps, **known)) for i, K in enumerate(Ks)]
     if confidence is not None:
         agreement = confidence.new_tensor([points_agreement(verdict.indicators) for verdict in verdicts])
         confidence = confidence * agreement.view(-1, 1, 1, 1)
@@ -205,7 +205,7 @@ def assemble_output(
 def _reprojected(
     run: GuidedRun, depth_m: Tensor, lefts: Tensor, K: Tensor
 ) -> tuple[Tensor, Tensor] | tuple[None, None]:
-    """Visibility and photometric error of every image, ``(N, 1, H, W)``; nothing where no view is."""
+    """Visibility and photometric error of every image, ``(N, 1, H, W)``; ``None`` without right views."""
     maps = [
         reprojection(evidence.native_views, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1])
         for i, evidence in enumerate(run.evidence)
@@ -218,7 +218,7 @@ def _reprojected(
 
 
 def _over_prior(run: GuidedRun, depth_m: Tensor) -> Tensor | None:
-    """``(N * E, h w)`` the depth ``(N, 1, H, W)`` over a metric prior's own, on the prior's grid."""
+    """``(N * E, h w)`` ratio of ``depth_m (N, 1, H, W)`` to a metric prior's depth, on the prior's grid."""
     maps = [t.prior_depth for t in run.trajectories if t.prior_depth is not None]
     if len(maps) < len(run.trajectories):
         return None
@@ -228,7 +228,7 @@ def _over_prior(run: GuidedRun, depth_m: Tensor) -> Tensor | None:
 
 
 def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> MetricDepthOutput:
-    """An output without a unit, with all its lengths in the metres of a prior that has some."""
+    """Convert an output without a unit to the metres of a metric prior."""
     factor = 1.0 / float(over_prior.median())
     spread = 1.4826 * float((over_prior * factor).clamp_min(1e-9).log().abs().median())
 
@@ -263,7 +263,7 @@ def _indicators(
     over_prior: Tensor | None,
     **more: Any,
 ) -> Indicators:
-    """Indicators of one image; matches to judge it by are made here, where its run used none."""
+    """Indicators of one image; if its run used no matches, they are made here for the verdict."""
     if confidence is not None:
         more["confidence"] = float(confidence[image].mean())
     if over_prior is not None:
@@ -299,9 +299,9 @@ def _warnings(run: GuidedRun, visible: Tensor | None, verdicts: Sequence[Verdict
         if share < LITTLE_OVERLAP:
             sentences.append(
                 f"Only {share:.0%} of the left image is seen by a right camera at this depth; "
-                "scale rests on little."
+                "few pixels determine the scale."
             )
-        reasons = {INVERSE, *verdict.indicators.mistakes}  # of a pose: in the verdict already
+        reasons = {INVERSE, *verdict.indicators.mistakes}  # mistakes of a pose are in the verdict already
         sentences += [sentence for sentence in run.evidence[i].warnings if sentence not in reasons]
         prefix = "" if len(verdicts) == 1 else f"Image {i + 1}: "
         warnings += [prefix + sentence for sentence in sentences]

@@ -1,4 +1,4 @@
-"""Guidance on a live pipeline: switched on and off, what it refuses, and the guided call (S4, Figure 3)."""
+"""Switch guidance on a live pipeline on and off, check what cannot be guided, and guide a call (S4)."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ STOCK_ARGUMENTS = (
     *("output_type", "resample_method_input", "resample_method_output", "batch_size", "num_inference_steps"),
     *("processing_resolution", "ensemble_size", "generator", "latents"),
 )
-#: More than any call asks for, of steps, pixels or members.
+#: Upper bound on the steps, pixels and members that a call may ask for.
 MOST = 1 << 20
 
-# Mixed in before a class that has all of a stock pipeline.
+# ``GuidedCall`` is mixed in before a class that has all attributes of a stock pipeline.
 _Stock: Any = MarigoldDepthPipeline if TYPE_CHECKING else object
 
 
 class GuidedCall(_Stock):
-    """Mixin before a stock class: ``__call__`` takes ``guidance``, and ensembling is metric while guided."""
+    """Mixin for a stock pipeline: ``__call__`` takes ``guidance``, and a guided ensemble is in metres."""
 
     _guided_run: GuidedRun | None = None
 
@@ -55,14 +55,14 @@ class GuidedCall(_Stock):
         """The stock call; with ``guidance`` its depth is in metres.
 
         Args:
-            image: left image(s), as the stock call takes them; guided, all that ``right`` takes as well.
+            image: left image(s), as the stock call takes them; guided, also in any form of ``right``.
             *args: as the stock call takes them.
             guidance: the second view; ``None`` is the stock call, bit for bit.
             callback_on_step_end: ``f(pipe, i, t, {"latents", "metric_depth", "loss", "scale", "shift"})``;
-                ``latents`` in what it returns replace the pipeline's. The others are those of the last step
-                that was corrected or updated, and ``None`` before the first.
+                if it returns ``latents`` they replace the pipeline's. The other values are those of the last
+                step that was corrected or updated, and ``None`` before the first.
             strict: a depth that is not trusted, or not judged (``output.verdict``), is an error.
-            **kwargs: likewise.
+            **kwargs: as the stock call takes them.
 
         Returns:
             ``MetricDepthOutput``, or with ``return_dict=False`` the stock tuple (prediction, uncertainty,
@@ -70,10 +70,10 @@ class GuidedCall(_Stock):
 
         Raises:
             InputError: ``guidance`` is no ``GeometryGuidance``; a scheduler or offloading that cannot be
-                guided; an image that the right one could not be either; inputs that do not fit each other.
-            RuntimeError: updates inside ``torch.inference_mode()``, or a call by a hook of the networks of a
-                guided call. From ``callback_on_step_end`` the pipeline may be called, guided or not: there it
-                is as the user left it. A call in another thread waits.
+                guided; an image in a form that is not supported; inputs that do not fit each other.
+            RuntimeError: updates inside ``torch.inference_mode()``, or a call by a hook on a network during a
+                guided call. ``callback_on_step_end`` may call the pipeline, guided or not: it is restored
+                while the callback runs. A call in another thread waits.
         """
         if guidance is None and callback_on_step_end is not None:
             bad_value("callback_on_step_end", "given together with guidance", "guidance=None")
@@ -99,7 +99,7 @@ class GuidedCall(_Stock):
     def _call_guided(
         self, call: dict[str, Any], guidance: GeometryGuidance, callback: StepCallback | None, held: Exclusive
     ) -> tuple[GuidedRun, Any]:
-        """The stock call with everything in place; ``call`` becomes what it was given in the end."""
+        """Prepare the run and make the stock call; ``call`` is updated to its final arguments."""
         lefts_01 = left_images(call["image"])  # (N, 3, H, W)
         prior = prior_of(self)
         _check_arguments(call, len(lefts_01))
@@ -122,14 +122,14 @@ class GuidedCall(_Stock):
         warm = plan_warm_start(self, prior, guidance, call, grid.size)
         if warm is not None and warm.latents is not None:
             call |= {"latents": warm.latents, "generator": None}  # the latents hold the noise already
-        # Channels last, as the stock call reads pictures; beside latents Marigold takes none such.
+        # Channels last, as the stock call reads pictures; with given latents Marigold does not accept it.
         layout = torch.channels_last if call["latents"] is None else torch.contiguous_format
         call["image"] = lefts_01.contiguous(memory_format=layout)
         run = GuidedRun(self, prior, guidance, evidence, call, grid, rounds, callback, tiny, held, warm)
         try:
             with run:
-                told = {"return_dict": True, "output_latent": True, "output_type": "pt"}
-                stock = super().__call__(**call | told)
+                fixed = {"return_dict": True, "output_latent": True, "output_type": "pt"}
+                stock = super().__call__(**call | fixed)
         finally:
             run.release()
         run.check_finite()
@@ -144,7 +144,7 @@ class GuidedCall(_Stock):
         return ProcessingGrid((padded.shape[-2] - padding[0], padded.shape[-1] - padding[1]), padding)
 
     def progress_bar(self, iterable: Any = None, total: int | None = None, **kwargs: Any) -> Any:
-        """Stock bars, one within another; while guided, one bar of the run's own stands for all."""
+        """Stock progress bars; while guided they are off, because the run shows one bar for all."""
         if self._guided_run is None:
             return super().progress_bar(iterable, total, **kwargs)
         return tqdm(iterable, total=total, disable=True)
@@ -164,13 +164,13 @@ class GuidedCall(_Stock):
         return ensemble_metric(depth, kwargs.get("reduction", "median"), lower)
 
     def put_together(self, maps: Tensor, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor | None]:
-        """A prior's own ending of ensembles; while guided, ``ensemble_depth`` for every image."""
+        """The prior's way to combine ensembles; while guided, ``ensemble_depth`` for every image."""
         if self._guided_run is None:
             return super().put_together(maps, *args, **kwargs)
         return DepthDiffusionPipeline.put_together(self, maps, *args, **kwargs)
 
     def save_pretrained(self, *args: Any, **kwargs: Any) -> None:
-        """Save the stock pipeline: the folder loads where this package is not installed."""
+        """Save the stock pipeline, so that the folder loads without this package."""
         with Exclusive(self, guided=False):
             twin = copy.copy(self)
         twin.__class__ = _stock_class(type(self))
@@ -178,7 +178,7 @@ class GuidedCall(_Stock):
 
 
 def _bind(stock_call: Callable[..., Any], *args: Any, **kwargs: Any) -> dict[str, Any]:
-    """All arguments of the stock call by name, defaults and what a prior adds included."""
+    """All arguments of the stock call by name, with defaults and those that a prior adds."""
     signature = inspect.signature(stock_call)
     bound = signature.bind(*args, **kwargs)
     bound.apply_defaults()
@@ -213,7 +213,7 @@ def _check_guided_call(guidance: Any, callback: Any) -> None:
 
 
 def _check_arguments(call: Mapping[str, Any], images: int) -> None:
-    """Refuse arguments of the call, by name, that no pipeline takes, for so many left images."""
+    """Refuse arguments that no pipeline takes; ``images`` is the number of left images."""
     check_choice(call["output_type"], "output_type", ("np", "pt"))
     check_choice(call["resample_method_input"], "resample_method_input", RESAMPLING)
     check_choice(call["resample_method_output"] or "bilinear", "resample_method_output", RESAMPLING)
@@ -252,7 +252,7 @@ def _check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) ->
 
 
 def _check_weights_stay(name: str, module: torch.nn.Module, differentiated: bool) -> None:
-    """Refuse hooks that take weights away, or make others of them, before a backward pass needs them."""
+    """Refuse hooks that offload or cast weights before a backward pass needs them."""
     registry, hook = getattr(module, "_diffusers_hook", None), getattr(module, "_hf_hook", None)
     of_diffusers = "" if registry is None else " ".join(registry.hooks)
     of_accelerate = [h for h in getattr(hook, "hooks", [hook]) if type(h).__name__ == "AlignDevicesHook"]
@@ -267,13 +267,13 @@ def _check_weights_stay(name: str, module: torch.nn.Module, differentiated: bool
 
 
 def _one_member(call: dict[str, Any]) -> dict[str, Any]:
-    """What changes of a call's arguments for the ensemble of a prior that gives the same map every time."""
+    """The arguments to change so that a prior that always gives the same map runs one member only."""
     first = slice(None, None, call["ensemble_size"])
     changed = {"ensemble_size": 1, "output_uncertainty": False}
     for name, kind in (("generator", list), ("latents", Tensor)):
         if isinstance(call[name], kind):
             changed[name] = call[name][first]
-    warn("This prior gives the same map every time: of the ensemble one member runs.", stacklevel=5)
+    warn("This prior gives the same map every time: only one member runs.", stacklevel=5)
     return changed
 
 

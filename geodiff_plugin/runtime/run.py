@@ -1,4 +1,4 @@
-"""One guided call: where it starts (SDEdit, Meng et al. 2022, for a previous frame), its hooks, its state."""
+"""``GuidedRun``: state and hooks of one guided call; its start from a previous frame (SDEdit, Meng 2022)."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ PROMPT_LONG_EDGE = 256
 
 @dataclass(frozen=True)
 class WarmStart:
-    """Where a call starts, after the frame before."""
+    """Where a call starts after a previous frame."""
 
     near_m: Tensor  # (N * E,) metres, depth of the nearest end of the relative map
     far_m: Tensor  # (N * E,) metres, of its farthest end
     skipped: int = 0  # steps of the schedule that are left out
-    latents: Tensor | None = None  # (N * E, C, h, w) what the first remaining step begins with, or noise
+    latents: Tensor | None = None  # (N * E, C, h, w) start of the first remaining step; ``None`` for noise
 
 
 def plan_warm_start(
@@ -59,8 +59,8 @@ def plan_warm_start(
 ) -> WarmStart | None:
     """The start that ``guidance.previous`` gives to a call on a padded grid ``size``; ``None`` without it.
 
-    The latent is taken over by a DDIM of two steps or more. Others take over the scale alone. ``InputError``
-    for an output of other images, members or size, or of a prior of another space.
+    A DDIM schedule of two steps or more starts from the previous latent; others take over the scale alone.
+    ``InputError`` for an output of other images, members or size, or of a prior of another space.
     """
     previous = guidance.previous
     if previous is None:
@@ -70,11 +70,11 @@ def plan_warm_start(
     given, wanted = tuple(previous.scale.shape), (len(guidance.inputs), call["ensemble_size"])
     if given != wanted:
         bad_value("previous", "an output of {} images of {} members".format(*wanted), given)
-    if previous.space not in (None, prior.space):  # None of one that was put together by hand
+    if previous.space not in (None, prior.space):  # ``None`` if the output was made by hand
         expected = f"the output of a prior whose map is affine in {prior.space}"
         bad_value("previous", expected, f"one in {previous.space}", "Use one prior for a whole sequence.")
     device, steps = pipe._execution_device, call["num_inference_steps"]
-    # Its lengths may have become a metric prior's metres, where those of this call are in baselines.
+    # A metric prior may have rescaled the previous output to metres; this call is in baselines.
     metres = 1.0 if guidance.unit else previous.rescaled
     affine = (cast(Tensor, v) for v in (previous.scale, previous.shift, previous.global_scale))
     ends = SPACES[prior.space].range_of(*(v.flatten().float() for v in affine))
@@ -103,7 +103,7 @@ def _noise(z0: Tensor, prior: DepthPrior, call: Mapping[str, Any], device: torch
     if noise is None:
         depth = z0[:, prior.depth_channels]
         noise = randn_tensor(depth.shape, generator=call["generator"], device=device, dtype=z0.dtype)
-        # What a prior denoises beside depth, GeoWizard's normals, starts from the same noise.
+        # Further maps that a prior denoises, such as GeoWizard's normals, start from the same noise.
         return noise.repeat(1, z0.shape[1] // depth.shape[1], 1, 1)
     if not isinstance(noise, Tensor):
         bad_type("latents", "None or a torch.Tensor", noise)
@@ -113,7 +113,7 @@ def _noise(z0: Tensor, prior: DepthPrior, call: Mapping[str, Any], device: torch
 
 
 def depth_prompt(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor | None:
-    """``(N, 1, h, w)`` metres: flat maps corrected by matches and points; ``None`` if one has neither."""
+    """``(N, 1, h, w)`` metres: flat maps corrected by matches and points; ``None`` if one image has none."""
     maps = []
     for image in evidence:
         confident, points = Matches.stack([image.reliable]), Matches.stack([image.points])
@@ -134,7 +134,7 @@ def depth_prompt(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor
 class GuidedRun:
     """State of one guided call, whose stock arguments are ``call``, with ``rounds`` in each denoising step.
 
-    ``held`` is released while the ``callback`` runs.
+    ``held``, the locks of the call, are released while the ``callback`` runs.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class GuidedRun:
             if self._tap is not None:
                 stack.enter_context(self._tap.attached())
             stack.enter_context(self._scheduler.attached())
-            # Its decode and ensembling then know that they are guided.
+            # Tells the pipeline's decoding and ensembling that they are guided.
             stack.enter_context(replaced(self.pipe, "_guided_run", self))
             self._stack = stack.pop_all()
         return self
@@ -190,7 +190,7 @@ class GuidedRun:
         self._stack.close()
 
     def release(self) -> None:
-        """Close the bar, and undo what ties the run and its hooks together: the collector knows no device."""
+        """Close the bar, and break the reference cycle with the hooks, which would keep device memory."""
         if self._bar is not None:
             self._bar.close()
         self._scheduler.release()
@@ -211,7 +211,7 @@ class GuidedRun:
         """Metric depth ``(B, 1, H, W)`` of the next chunk of final latents, on the padded processing grid."""
         chunk = len(self.relative)
         trajectory, x = self.trajectories[chunk], self._results[chunk]
-        if x is None:  # else as it was encoded: decoding adds the autoencoder's loss, and noise
+        if x is None:  # otherwise skip decoding, which adds the autoencoder's loss
             x = self.prior.decode(latents[:, self.prior.depth_channels]).float()
         x = self.grid.padded(x)
         self.relative.append(self.grid.cropped(x))
@@ -221,7 +221,7 @@ class GuidedRun:
         return depth_m
 
     def within_range(self, depth_m: Tensor, image: int | None = None) -> Tensor:
-        """Keep maps of all images, or of one's members, in the range before resizing, which overshoots."""
+        """Clamp maps of all images, or of one image's members, to their range before resizing (overshoot)."""
         samples = [i for i, owner in enumerate(self.owners) if image in (None, owner)]
         near_m, far_m = (
             torch.cat(ends).to(depth_m)[samples].view(len(depth_m), -1, 1, 1)
@@ -230,13 +230,13 @@ class GuidedRun:
         return depth_m.clamp_(near_m.amin(1, keepdim=True), far_m.amax(1, keepdim=True))
 
     def samples_of(self, image: int) -> list[tuple[Trajectory, int]]:
-        """The samples of an image: the trajectory of each, and its place in that."""
+        """The samples of an image, each as its trajectory and its index there."""
         return [(t, i) for t in self.trajectories for i, owner in enumerate(t.owners) if owner == image]
 
     def kept_and_error(self, image: int, member: int | None = None) -> tuple[Tensor | None, Tensor | None]:
-        """By one member or the mean of all, ``(1, 1, h, w)`` each, ``None`` where not measured.
+        """``Trajectory.kept`` and the ``local_error`` of one member, or their means over all members.
 
-        The share of each match's confidence that remains without reflections, and the ``local_error``.
+        ``(1, 1, h, w)`` each, ``None`` where not measured.
         """
         samples = self.samples_of(image)
         chosen = samples if member is None else samples[member : member + 1]
@@ -263,7 +263,7 @@ class GuidedRun:
         first = len(self.trajectories) * self.batch_size
         chunk = slice(first, first + self.batch_size)
         start = None if self._warm is None else (self._warm.near_m[chunk], self._warm.far_m[chunk])
-        plan, prior, own_m = self._plan, self.prior, self.prior.own_range
+        plan, prior, metres = self._plan, self.prior, self.prior.own_range
         self.trajectories.append(
             Trajectory(
                 self.config,
@@ -271,7 +271,7 @@ class GuidedRun:
                 self.owners[chunk],
                 prior.space,
                 step_latents=plan.step_latents,
-                prior_range=None if own_m is None else (own_m[chunk, 0], own_m[chunk, 1]),
+                prior_range=None if metres is None else (metres[chunk, 0], metres[chunk, 1]),
                 start_range=start,
                 valid=None if prior.valid is None else prior.valid[chunk],
             )
@@ -287,7 +287,7 @@ class GuidedRun:
             self._bar = tqdm(total=chunks * len(timesteps), **options)
 
     def guide(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> StepInputs:
-        """What the scheduler's step is given for the network's ``output`` and ``z_t (B, C, h, w)``."""
+        """Guide one step: what the scheduler's step gets instead of ``output`` and ``z_t (B, C, h, w)``."""
         trajectory, schedule = self.trajectories[-1], self.schedule
         assert schedule is not None  # of begin
         trajectory.step = self._step, self._timesteps[self._step]
@@ -296,13 +296,13 @@ class GuidedRun:
         estimate = StepEstimate(self._codec, level, output, z_t, self._tap, latent_is_read)
         if self._step == 0:
             trajectory.note("the prior's output", estimate.output)
-        inputs: StepInputs = output, z_t, None  # bit for bit the pipeline's own step
+        inputs: StepInputs = output, z_t, None  # unchanged, for the stock step bit for bit
         self._results[-1] = None
         if rounds := schedule.steps[self._step]:
             with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
-                move, self._shown, stands = guided_step(trajectory, estimate, rounds, is_last)
-            # A tiny decoder's map is no result.
-            if stands and (self._codec.tiny is None or not latent_is_read):
+                move, self._shown, is_current = guided_step(trajectory, estimate, rounds, is_last)
+            # The map of a tiny decoder is not the result.
+            if is_current and (self._codec.tiny is None or not latent_is_read):
                 self._results[-1] = self._shown
             if schedule.moves_at(self._step):
                 inputs = estimate.step_inputs(move, self.config.step_from == "updated")
@@ -324,7 +324,7 @@ class GuidedRun:
         if self._bar is not None:
             history = self.trajectories[-1].history
             loss = history[-1].loss if history else None
-            # Another device would be waited for.
+            # Reading from a GPU would wait for it.
             if loss is not None and not self._bar.disable and loss.device.type == "cpu":
                 self._bar.set_postfix(loss=f"{float(loss.mean()):.4f}", refresh=False)
             self._bar.update()
@@ -332,7 +332,7 @@ class GuidedRun:
 
     def _seen_by_callback(self, latents: Tensor) -> dict[str, Tensor | None]:
         trajectory, x = self.trajectories[-1], self._shown
-        if x is None:  # the steps before the first correction are the prior's own
+        if x is None:  # steps before the first correction are not guided
             return dict.fromkeys(("metric_depth", "loss", "scale", "shift"))
         if self._step == len(self._timesteps) - 1:
             x = self._codec.decode(latents[:, self.prior.depth_channels], final=True)

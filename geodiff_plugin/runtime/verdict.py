@@ -1,6 +1,6 @@
-"""Whether a result can be trusted, and if not, why: indicators of a run, and a verdict on them.
+"""``Verdict``: whether a result can be trusted, and if not, why; judged by the ``Indicators`` of a run.
 
-A rectified pair with a wrong focal length, or a likely but wrong baseline, matches as well as a right one.
+No indicator shows a wrong focal length of a rectified pair, or a wrong baseline of a plausible length.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.pose.mistakes import INVERSE
 
-#: Confidence from which a match counts.
+#: Matches above this confidence count.
 CONFIDENT = 0.5
 #: Two images whose values differ by less, in [0, 1], and by less than this share of their contrast (all
 #: pictures that are nearly black differ by little), are the same picture.
@@ -26,40 +26,40 @@ SAME, SAME_SHARE = 1.5 / 255, 0.05
 #: Points that are compared with matches: at least so many, each with matches this near, pixels of the grid.
 FEWEST_COMPARED, REACH_PX = 12, 3
 FEWEST_MATCHES = 40
-#: Median difference of the depth from what both views match from which it is not to be trusted.
+#: A depth that differs from the matches by this in the median of the absolute log is not trusted.
 OFF_MATCHES = math.log(1.2)
 #: Log of the ratio of the 95 % and the 5 % quantile of depth below which a scene may be one plane.
 FLAT = 0.2
 #: Below this mean confidence, and this share matched, a run is not to be trusted. Right pairs, real and
 #: rendered, had .66 to .98 and .32 to .96; where nothing is matched, confidence is about .45.
 LEAST_CONFIDENCE, LEAST_MATCHED = 0.5, 0.12
-#: The same of a rank correlation of near and far, which was +.18 to +.97.
+#: The same for the rank correlation of near and far, which was +.18 to +.97 for right pairs.
 MOST_EXCHANGED = -0.2
-#: No agreement on near and far is bad where few pixels are matched; with many, a poor prior may be at fault.
+#: A rank correlation below the first number is bad unless this share is matched: a poor prior may cause it.
 LEAST_ORDER, MATCHED_ENOUGH = 0.2, 0.5
-#: Two weak signs together weigh as much as one that is bad; so does an epipolar distance, in pixels.
+#: Two weak indicators together count as a bad one; the last is the distance to epipolar lines, in pixels.
 WEAK_CONFIDENCE, WEAK_MATCHED = 0.6, 0.4
 WEAK_ORDER, WEAK_EPIPOLAR_PX = 0.45, 1.0
 #: A rank correlation says nothing of a scene whose matched depths lie within this (log of 95 % over 5 %).
 LEAST_SPREAD = 0.15
 #: Points and matches that differ by the first factor are reported; by the second, the result is not trusted.
 POINTS_REPORTED, POINTS_WRONG = math.log(1.08), math.log(1.2)
-#: Share of the points that differ so, one by one, from which that is reported, or is not trusted. Of dense
-#: maps some always do: at edges, and where a view is hidden.
+#: Share of the points that differ by the second factor, one by one, above which this is reported, or the
+#: result not trusted. In dense maps some always do: at edges, and where a view is occluded.
 MANY_OFF, MOST_OFF = 0.25, 0.5
-#: A rig's baseline in metres is longer, and a lens's horizontal field of view lies between these, in degrees:
-#: that of 135 mm and that of 10 mm in 35 mm equivalent. A long baseline is warned of when it is given.
+#: Shortest plausible baseline, metres; plausible horizontal fields of view, degrees (135 mm and 10 mm in
+#: 35 mm equivalent). ``check_baseline`` warns of long baselines.
 LEAST_BASELINE_M, VIEWS_DEG = 1e-3, (15.0, 120.0)
-#: No lens that keeps lines straight sees as much, degrees.
+#: Wider than any lens without distortion, degrees.
 TOO_WIDE_DEG = 150.0
 #: Factor over a metric prior's own metres from which the difference is reported.
 OWN_METRES = math.log(1.9)
-#: Distance of matches from their epipolar lines, under the best pose near the given one, from which they are
-#: reported, and are not trusted; pixels of the grid of the matches.
+#: Distance of matches from their epipolar lines, under the best pose near the given one, that is reported,
+#: and that is not trusted; pixels of the grid of the matches.
 EPIPOLAR_PX, EPIPOLAR_WRONG = 2.0, 4.0
 #: Known depths that fix a scale and a shift, and show when one of them is wrong.
 LEAST_POINTS = 3
-#: Share of the matches on the first or last plane of a range from which it is too narrow.
+#: A given range is too narrow if this share of the matches lies on its first or last plane.
 MOST_AT_END = 0.05
 
 #: Factor of the points over the views -> the likely cause.
@@ -105,7 +105,7 @@ class Indicators:
 class Verdict:
     """Whether one image's depth can be trusted."""
 
-    status: str  # "trusted", "not trusted", or "not judged": nothing was there to hold it against
+    status: str  # "trusted", "not trusted", or "not judged": there was nothing to compare it with
     reasons: tuple[str, ...]  # sentences on what speaks against it, the likeliest cause first
     remarks: tuple[str, ...]  # on what is unusual but may be right
     indicators: Indicators
@@ -133,7 +133,7 @@ def _alike(image_01: Tensor, left_01: Tensor) -> bool:
 
 
 def _points_indicators(matches: Matches, points: Matches) -> dict[str, float]:
-    """Median ratio of points to matched depths, and the share that contradicts; none for too few of them."""
+    """Median ratio of points to matched depths, and the share that differs; empty for too few of them."""
     confident = (matches.confidence > CONFIDENT).float()
     window = (2 * REACH_PX + 1, 1, REACH_PX)
     near = F.avg_pool2d(confident[None], *window)[0]
@@ -147,7 +147,7 @@ def _points_indicators(matches: Matches, points: Matches) -> dict[str, float]:
 
 
 def _match_indicators(matches: Matches, depth_m: Tensor | None, planes: Tensor | None) -> dict[str, Any]:
-    """Share matched, spread of the depths, how far the result lies from them, and how many on the ends."""
+    """Share matched, spread of the depths, deviation of the result, share on the first or last plane."""
     confident = matches.confidence > CONFIDENT
     numbers: dict[str, Any] = {"matched": float(confident.float().mean())}
     inverse_depth = matches.inverse_depth[confident & (matches.inverse_depth > 0)]

@@ -1,1 +1,1 @@
-"""Metres of a relative map: the parametrisation (``space``), its search and its fit (S4.1, S7.3)."""
+"""Relative maps in metres: parametrisation (``space``), search and fit of the scale (S4.1, S7.3)."""

@@ -1,6 +1,6 @@
-"""Metres from matches and points: which minimum of the search is right, the fit within it, near against far.
+"""Scale from matches and points: choose a minimum of the search, fit within it, check the depth order.
 
-The range of the points is where Marigold-DC starts (Viola et al. 2024, Eq. 2).
+Marigold-DC starts from the range of the points (Viola et al. 2024, Eq. 2).
 """
 
 from __future__ import annotations
@@ -17,28 +17,27 @@ from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.matches import UNIT
 from geodiff_plugin.scale.space import SPACES, MetricMap, Space
 
-#: Matches above this confidence are reliable; as few of them make a basin or a quantile.
+#: Matches above this confidence are reliable; fewer than the second number are not used.
 RELIABLE, FEWEST_RELIABLE = 0.5, 50
-#: Values of near, and of far, that are tried against reliable matches or points, and the points that tell
-#: basins apart.
+#: Candidates of near, and of far, in the search by points or reliable matches; upper bound on these points.
 BASIN_CANDIDATES, BASIN_SAMPLES = 48, 1500
-#: How far beyond the points' own range the values reach, as a factor.
+#: Factor by which the candidates reach beyond the range of the points.
 BASIN_REACH = 4.0
-#: Width of their Cauchy cost in units of the points, about a prior's own error; a current state within this
-#: factor of the best cost stays.
+#: Width of the Cauchy cost in units of the points, about the error of a prior; the current state stays if
+#: its cost is within this factor of the best.
 BASIN_CAUCHY, BASIN_KEEP = 32.0, 1.05
-#: Reweighted Gauss-Newton steps on near and far, and matches that the fit looks at.
+#: Reweighted Gauss-Newton steps on near and far; upper bound on the matches of the fit.
 FIT_ITERATIONS, FIT_SAMPLES = 12, 20_000
-#: Standard deviation of a match of confidence .96, planes; the least one in log depth, of what a map leaves.
+#: Standard deviation of a match of confidence .96, planes; least one of the map's residuals, log depth.
 FIT_NOISE, FIT_FLOOR = 0.5, 4e-3
-#: Width of the Cauchy weight, in standard deviations of both.
+#: Width of the Cauchy weight, in standard deviations of match and map together.
 FIT_CAUCHY = 2.0
-#: How far near and far may move, as log factors.
+#: Bounds of the change of near and of far in the fit, as log factors.
 NEAR_REACH, FAR_REACH = 1.4, 0.7
-#: Reliable matches that the order of near and far is read from; fewer than the last number say nothing.
+#: Upper and lower bound on the reliable matches whose depth order is compared with the prior's.
 ORDER_SAMPLES, ORDER_FEWEST = 4000, 40
-# What a match leaves to doubt, ``1 - confidence``, tells its variance as well: on pairs with truth the error
-# of matches, in planes, grows with its root. At the first ``FIT_NOISE`` holds; it falls to a share of it.
+# The variance of a match is proportional to its doubt, ``1 - confidence``: so it was on pairs with truth.
+# ``FIT_NOISE`` holds at the first doubt; lower doubts count as this share of it at least.
 _REFERENCE_DOUBT, _LEAST_DOUBT = 0.04, 0.16
 
 
@@ -49,7 +48,7 @@ def depth_span(points: Matches) -> tuple[Tensor, Tensor]:
 
 
 def reliable_matches(matches: Matches) -> Matches | None:
-    """The matches that are more likely right than wrong, as if they were points; ``None`` for too few."""
+    """Matches that are more likely right than wrong, in the form of points; ``None`` for too few."""
     reliable = (matches.confidence > RELIABLE) & (matches.inverse_depth > matches.plane_step)
     if int(reliable.sum()) < FEWEST_RELIABLE:
         return None
@@ -83,7 +82,7 @@ def fit_to_points(
         depth_m = metric(row.expand(len(near), 1, 1, -1), metric.from_range(near, far))[:, 0, 0]
         e = (1.0 / depth_m - target) / (BASIN_CAUCHY * points.plane_step)
         cost = torch.log1p(e * e).mean(1)
-        best = cost.argmin(keepdim=True)  # a 0-d index would be read back
+        best = cost.argmin(keepdim=True)  # a 0-d index would be read back from the device
         if current is not None:
             best = torch.where(cost[:1] <= BASIN_KEEP * cost[best], torch.zeros_like(best), best)
         best_ends.append(torch.cat([near[best], far[best]]))
@@ -98,12 +97,12 @@ def refine_to_matches(
     """Metres ``(B,)`` of both ends of one image's relative maps ``x (B, 1, h, w)``: a robust fit to matches.
 
     Matches have outliers, so they refine ``near_m`` and ``far_m``, the search's result, and never replace it.
-    Residuals are in the logarithm of inverse depth and the noise of a match together: relative where matches
-    are exact, even for noise of either sign near infinity, where a plain logarithm favours matches that err
-    towards the camera. Each is in units of its match's own noise and of what the map leaves over, measured at
-    every iteration: a map that is right is fitted to the noise of its matches, a map that errs as a whole.
+    A residual is the log ratio of inverse depths, to each of which the noise of a match is added: a relative
+    error where matches are exact, and symmetric near infinity, where a plain logarithm favours matches that
+    err towards the camera. It is weighted by the variances of its match and of the map, whose residuals are
+    measured at every iteration: an exact map follows its most exact matches, an inexact one all of them.
     """
-    at = matches.above(0.0)  # points are few: not one may be missed
+    at = matches.above(0.0)  # all of them: known points are few
     if not len(at):
         return near_m, far_m
     at = at[:: max(1, len(at) // FIT_SAMPLES)]
@@ -129,14 +128,14 @@ def _ends(form: Space, near_m: Tensor, far_m: Tensor) -> Tensor:
 
 
 def ordered(near_m: Tensor, far_m: Tensor) -> tuple[Tensor, Tensor]:
-    """Both ends, near at most 0.98 of far: a range of nothing has no scale."""
+    """Both ends, near at most 0.98 of far: an empty range has no scale."""
     return torch.minimum(near_m, far_m * 0.98), far_m
 
 
 class _Fitted(NamedTuple):
-    """Of P matches, ``(P,)`` each: inverse depth >= 0, confidence, and doubt, a deviation in units of noise.
+    """P matches, ``(P,)`` each: inverse depth >= 0, confidence, and standard deviation in units of ``noise``.
 
-    ``noise``, ``()``, is that of a match of the reference confidence, 1/m.
+    ``noise``, ``()``, is the standard deviation of a match of the reference confidence, 1/m.
     """
 
     inverse: Tensor
@@ -156,8 +155,8 @@ def _refine_once(
     shares = torch.stack([1.0 - values, values], -1)  # (B, P, 2)
     v, gap = (shares @ ends[:, :, None])[..., 0], (ends[:, 1:] - ends[:, :1]).abs()
     h = 1e-3 * torch.maximum(gap, 1e-2 * ends.abs().amax(1, keepdim=True))
-    # A match's relative noise is taken at the map's depth. At the match's own, of two far matches with
-    # opposite errors the one that comes out nearer would count for more.
+    # The relative noise is taken at the map's depth. At the match's depth, of two far matches with opposite
+    # errors the nearer one would count for more.
     mapped = (-log_depth(v)).exp()
     above = mapped + fitted.noise
     residual = ((fitted.inverse + fitted.noise) / above).log().clamp(-1.0, 1.0)
@@ -170,11 +169,11 @@ def _refine_once(
     normal = torch.einsum("bpi,bp,bpj->bij", J, weight, J)
     gradient = torch.einsum("bpi,bp,bp->bi", J, weight, residual)
     diagonal = normal.diagonal(dim1=1, dim2=2)
-    # One point alone leaves a direction open. Damped less, float32's rounding errors choose along it.
+    # One point leaves a direction undetermined; with less damping rounding errors would choose along it.
     damped = normal + torch.diag_embed(1e-4 * diagonal + 1e-12 * diagonal.sum(1, keepdim=True) + 1e-20)
     free = ends - torch.linalg.solve_ex(damped, gradient).result  # unchecked: a check waits for the device
     bound = torch.minimum(torch.maximum(free, bounds[0]), bounds[1])
-    # Where one end is stopped by its bound, the other one is the best for that.
+    # If one end is at its bound, the other end is solved for that.
     moved = bound - ends
     alone = ends - (gradient + normal.flip(2).diagonal(dim1=1, dim2=2) * moved.flip(1)) / (diagonal + 1e-20)
     settled = torch.where((bound != free).flip(1), alone, bound)
@@ -190,9 +189,9 @@ def _ranks(values: Tensor) -> Tensor:
 
 @torch.no_grad()
 def order_agreement(x: Tensor, matches: Matches, space: str) -> Tensor:
-    """Spearman's rank correlation of nearness ``(B,)``, as relative maps and matches of one image have it.
+    """Spearman's rank correlation ``(B,)`` of nearness in relative maps with that in matches of one image.
 
-    ``x (B, 1, h, w)`` is of the prior alone. NaN where fewer than 40 matches are reliable.
+    ``x (B, 1, h, w)`` is of the prior alone. NaN if fewer than 40 matches are reliable.
 
     Convention:
         Cameras in the wrong order turn near into far: -1 where +1 is right.

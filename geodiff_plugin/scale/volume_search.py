@@ -1,7 +1,7 @@
 """Search for the scale of a relative map, by lookup in a plane-sweep volume (S7.3).
 
-The paper's single number, x = g_s x_rel, prefers depths at which every pixel leaves the right image; (near,
-far) jointly, on pixels that stay in view, does not (docs/reference/paper-map.md).
+The paper's search over one number, x = g_s x_rel, prefers depths at which every pixel leaves the right image.
+A joint search for (near, far) on pixels that stay in view does not (docs/reference/paper-map.md).
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from torch import Tensor
 from geodiff_plugin.matching import CostVolume
 from geodiff_plugin.scale.space import SPACES
 
-#: Cost beyond which a pixel is an outlier: occluded, mirrored, mistaken by the prior.
+#: Cost beyond which a pixel is an outlier: occluded, a reflection, or wrong in the prior.
 COST_CLAMP = 0.35
-#: Pixels that the search looks at; of these, those that tell basins apart in the coarse grid.
+#: Pixels of the search; pixels of its coarse grid.
 SAMPLES, COARSE_SAMPLES = 6000, 1500
 #: Values of near, and of far, in the coarse grid, and in each of the two finer ones.
 COARSE_GRID, FINE_GRID = 48, 13
-#: A current state this close to the best cost stays: a new one restarts the updates of scale and shift.
+#: The current state stays if its cost is this close to the best: a new one restarts scale and shift.
 KEEP_MARGIN = 2e-3
-#: Least share of the pixels that must stay in view of a rectified pair, and of any other pose: at the true
-#: depth some pairs of the latter share only .3 of them.
+#: Least share of the pixels that must stay in view of a rectified pair, and of a posed pair: at the true
+#: depth some posed pairs share only .3 of them.
 IN_VIEW_RECTIFIED, IN_VIEW_POSED = 0.6, 0.25
 
 
@@ -51,13 +51,13 @@ def _lookup(
     step = (inverse_depth[-1] - inverse_depth[0]) / (planes - 1)
     position = (1.0 / depth_m - inverse_depth[0]) / step
     inside = (position >= 0) & (position <= planes - 1)
-    # NaN is no index; what computed it is named after the loop (``algorithm.gradients.FiniteWatch``).
+    # NaN cannot be an index; ``algorithm.gradients.FiniteWatch`` reports its origin after the loop.
     position = position.clamp(0, planes - 1).nan_to_num(0.0)
     below = position.floor().clamp_max(planes - 2).long()
     weight = position - below
     cost = torch.lerp(volume_cost.gather(0, below), volume_cost.gather(0, below + 1), weight)
     cost = cost.clamp_max(COST_CLAMP)
-    # Beyond the nearest plane nothing is known: as bad as an outlier, and not out of view.
+    # Beyond the nearest plane the cost is unknown: it counts as an outlier, not as out of view.
     cost = torch.where(inside, cost, torch.full_like(cost, COST_CLAMP))
     counted = in_view.gather(0, below) | ~inside
     count = counted.sum(1)
@@ -104,8 +104,8 @@ def search_scale(
         """The best of candidate ends ``(M,)`` for the values of one map, and its cost, ``(1,)`` each."""
         depth = SPACES[space].depth_at(row[None, ::every], near[:, None], far[:, None])
         mean, share = _lookup(cost[:, ::every], in_view[:, ::every], volume.inverse_depth, depth)
-        mean = mean + (share < least) * 1.0  # only if no pair keeps enough in view does one of these win
-        k = mean.argmin(keepdim=True)  # a 0-d index would be read back
+        mean = mean + (share < least) * 1.0  # so one of these wins only if no pair keeps enough in view
+        k = mean.argmin(keepdim=True)  # a 0-d index would be read back from the device
         return near[k], far[k], mean[k]
 
     results = []
@@ -118,7 +118,7 @@ def search_scale(
             near, far, mean = (
                 torch.where(kept, old, new) for old, new in zip(now, (near, far, mean), strict=True)
             )
-        # The volume's own near end lies nearer than anything seen, so only a given one can cut a scene off.
+        # The volume's near end lies nearer than any match, so only a given range can cut the scene off.
         on_edge = (far >= high * 0.98) | ((near <= low * 1.02) & (depth_range is not None))
         results.append((near, far, mean, on_edge))
     return ScaleSearch(*(torch.cat(column) for column in zip(*results, strict=True)))

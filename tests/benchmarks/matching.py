@@ -21,7 +21,7 @@ from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.geometry import plane_rays, warp_right_to_left
 from geodiff_plugin.matching.aggregation import aggregate
-from geodiff_plugin.matching.build import build_cost_volume, mirrored_pose_preferred, pilot_volume
+from geodiff_plugin.matching.build import build_cost_volume, inverse_pose_preferred, pilot_volume
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.sweep import CostVolume, median_shift, sweep_planes
 from geodiff_plugin.types import CameraView
@@ -121,7 +121,7 @@ def measure(pair: Pair, device: str = "cpu", repeats: int = 3) -> tuple[dict[str
 
     def evidence() -> None:
         found = match_volume(build_cost_volume(left, [right], K))
-        mirrored_pose_preferred(left, [right], K, found)
+        inverse_pose_preferred(left, [right], K, found)
 
     stages: dict[str, Callable[[], object]] = {
         "coarse sweep": lambda: pilot_volume(left, [right], K),
@@ -129,7 +129,7 @@ def measure(pair: Pair, device: str = "cpu", repeats: int = 3) -> tuple[dict[str
         "sweep": lambda: sweep_planes(volume.left_01, volume.rights, volume.K, volume.inverse_depth),
         "one aggregation": lambda: aggregate(volume.levels, volume.left_01[0]),
         "matches": lambda: match_volume(volume),
-        "swapped?": lambda: mirrored_pose_preferred(left, [right], K, matches),
+        "swapped?": lambda: inverse_pose_preferred(left, [right], K, matches),
         "evidence": evidence,
     }
     kind = 1 if device.startswith("cuda") else 0  # a GPU's work takes no CPU seconds

@@ -29,7 +29,7 @@ from geodiff_plugin.config import DEFAULT, MARIGOLD_DC, PAPER, UpdatePlan
 from geodiff_plugin.formats.images import intrinsics_from_exif
 from geodiff_plugin.geometry import hidden_in_right, is_rectified, project, resize_image, warp_right_to_left
 from geodiff_plugin.matching import build_cost_volume, points_to_matches, with_points
-from geodiff_plugin.matching.build import mirrored_pose_preferred
+from geodiff_plugin.matching.build import inverse_pose_preferred
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches, reject_reflections
 from geodiff_plugin.pose.estimate import find_scale
@@ -204,7 +204,7 @@ def matched() -> dict[str, object]:
     rights = [v._replace(image_01=image) for v, image in zip(views, blank[1:], strict=True)]
     result["blank_wall"] = match_volume(build_cost_volume(blank[0], rights, K)).confidence
     turned = [CameraView(v.image_01, v.K, torch.linalg.inv(v.T_right_from_left)) for v in views]
-    asked = [mirrored_pose_preferred(left, given, K) for given in (views, turned)]
+    asked = [inverse_pose_preferred(left, given, K) for given in (views, turned)]
     return result | {"mirrored": str(asked)}
 
 

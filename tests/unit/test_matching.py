@@ -11,7 +11,7 @@ from geodiff_plugin import geometry as g
 from geodiff_plugin import matching as m
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.matching import build
-from geodiff_plugin.matching.aggregation import NEVER, Room
+from geodiff_plugin.matching.aggregation import NEVER, Buffers
 from geodiff_plugin.matching.build import pilot_volume
 from geodiff_plugin.matching.census import COST_LEVELS
 from tests.benchmarks.matching import textured_pair
@@ -49,7 +49,7 @@ def test_motion_along_the_view_gives_matches(size, ahead, sideways):
     reliable = matches.confidence > 0.5
     assert reliable.float().mean() > 0.3
     assert ((matches.inverse_depth * truth)[reliable] - 1.0).abs().median() < 0.1
-    assert not m.mirrored_pose_preferred(left, [right], K)
+    assert not m.inverse_pose_preferred(left, [right], K)
 
 
 @pytest.mark.parametrize("size", [(500, 741), (1988, 2964), (375, 1242)])
@@ -108,11 +108,11 @@ def test_matches_in_any_pose(turn, at):
 
 
 def test_the_memory_of_an_aggregation_serves_the_next_and_the_worst_costs_do_not_overflow():
-    generator, room = torch.Generator().manual_seed(0), Room()
+    generator, buffers = torch.Generator().manual_seed(0), Buffers()
     for planes, height, width in ((7, 6, 9), (2, 1, 8), (12, 9, 3)):
         grey = torch.rand(height, width, generator=generator)
         levels = torch.randint(0, COST_LEVELS + 1, (planes, height, width), generator=generator).byte()
-        assert torch.equal(m.aggregate(levels, grey, room=room), m.aggregate(levels, grey))
+        assert torch.equal(m.aggregate(levels, grey, buffers=buffers), m.aggregate(levels, grey))
     levels = torch.full((4, 30, 40), COST_LEVELS, dtype=torch.uint8)
     levels[0, ::2] = 0
     out = m.aggregate(levels, torch.rand(30, 40, generator=generator))
@@ -122,16 +122,16 @@ def test_the_memory_of_an_aggregation_serves_the_next_and_the_worst_costs_do_not
 @pytest.mark.parametrize(("turn", "at"), [(0.0, SIDEWAYS), (0.06, (0.25, 0.1, 0.1))])
 def test_swapped_views_and_inverted_poses_are_told(monkeypatch, turn, at):
     left, right, K, _, _ = scene(turn, at)
-    assert not m.mirrored_pose_preferred(left, [right], K)
-    assert m.mirrored_pose_preferred(left, [(right[0], K, inverse_transformation(right[2]))], K)
-    assert m.mirrored_pose_preferred(right[0], [(left, *right[1:])], K)
+    assert not m.inverse_pose_preferred(left, [right], K)
+    assert m.inverse_pose_preferred(left, [(right[0], K, inverse_transformation(right[2]))], K)
+    assert m.inverse_pose_preferred(right[0], [(left, *right[1:])], K)
     asked = []
     monkeypatch.setattr(build, "pilot_volume", lambda *given: asked.append(given) or pilot_volume(*given))
     matches = find_matches(left, [right], K)
     before = len(asked)
-    assert not m.mirrored_pose_preferred(left, [right], K, matches) and len(asked) == before
+    assert not m.inverse_pose_preferred(left, [right], K, matches) and len(asked) == before
     unsure = replace(matches, confidence=0.1 * matches.confidence)
-    assert not m.mirrored_pose_preferred(left, [right], K, unsure) and len(asked) == before + 2
+    assert not m.inverse_pose_preferred(left, [right], K, unsure) and len(asked) == before + 2
 
 
 def test_errors_name_the_argument():

@@ -11,7 +11,7 @@ from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evaluation.figures import render_cloud
 from geodiff_plugin.formats.clouds import write_ply
 from geodiff_plugin.matching import build_cost_volume, match_volume, points_to_matches
-from geodiff_plugin.matching.build import mirrored_pose_preferred, pilot_volume, to_grid
+from geodiff_plugin.matching.build import inverse_pose_preferred, pilot_volume, to_grid
 from geodiff_plugin.matching.sweep import sweep_planes
 from geodiff_plugin.types import CameraView
 from tests.conftest import textured
@@ -58,7 +58,7 @@ def test_the_sweep_and_all_that_is_made_of_it():
         reliable = matches.confidence > 0.5
         assert reliable.float().mean() > 0.3
         assert float((1 / matches.inverse_depth[reliable]).median()) == pytest.approx(2.0, rel=0.04)
-    assert not mirrored_pose_preferred(left, rights, camera)
+    assert not inverse_pose_preferred(left, rights, camera)
     small = geometry.resize_intrinsics(tensor(K), SIZE, (36, 48))[0]
     np.testing.assert_allclose(evidence.K_left, small, rtol=1e-6)
 
