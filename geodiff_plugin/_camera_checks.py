@@ -29,7 +29,7 @@ def _as_matrix(value: Any, name: str, cure: str, *shapes: tuple[int, int]) -> np
     except (TypeError, ValueError, OverflowError):
         bad_type(name, f"a {rows}x{columns} matrix of numbers", value, cure)
     if matrix.shape not in shapes:
-        bad_value(name, f"a {rows}x{columns} matrix", f"shape {matrix.shape}", cure)
+        bad_value(name, f"a {rows}x{columns} matrix", f"shape {matrix.shape}" if matrix.ndim else value, cure)
     if not np.isfinite(matrix).all():
         bad_value(name, "finite", "NaN or infinity in it", "Check the calibration file.")
     return matrix

@@ -80,7 +80,7 @@ class PriorOptions:
 
     prior: str = declare("bundled", "'bundled', a hub id or a folder; KEY:folder says which kind.")
     space: str | None = declare(
-        None, "Space of the prior's map, unless its folder says: depth ...", choices=SPACES
+        None, "Space of the prior's map, if its folder says none: " + ", ".join(SPACES) + ".", choices=SPACES
     )
     steps: int | None = declare(None, "Denoising steps; default: the prior's, at least 4.", low=1, high=1000)
     seed: int = declare(0, "Seed of the noise.", low=0, high=2**63 - 1)
@@ -91,12 +91,8 @@ class PriorOptions:
 class RunOptions(PriorOptions):
     """How it runs: what ``geodiff depth``, the page and the ComfyUI node have in common."""
 
-    option: tuple[str, ...] = declare(
-        (), "An option of the prior, as NAME=VALUE (GeoWizard: domain=outdoor)."
-    )
-    ensemble: int = declare(
-        1, "Number of members; the spread of 2 or more is the uncertainty.", low=1, high=1000
-    )
+    option: tuple[str, ...] = declare((), "An option of the prior, NAME=VALUE (GeoWizard: domain=outdoor).")
+    ensemble: int = declare(1, "Members; the spread of 2 or more is the uncertainty.", low=1, high=1000)
     resolution: int | None = declare(None, "Longer side for the prior, px; 0: the image's.", low=0, high=8192)
     near: float | None = declare(None, "Nearest depth to search, metres.", above_0="metres")
     far: float | None = declare(None, "Farthest depth to search, metres.", above_0="metres")

@@ -67,8 +67,10 @@ def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[s
     return shares
 
 
-def write_results(capture: Capture, out: Path, names: Sequence[str], export: Sequence[str]) -> dict[str, Any]:
-    """Write, after ``write_agreement``, clouds, sheet and what ``export`` asks for; counts for the report."""
+def write_results(
+    capture: Capture, out: Path, names: Sequence[str], export: Sequence[str], doubted: Sequence[str]
+) -> dict[str, Any]:
+    """Write, after ``write_agreement``, clouds, a sheet that marks ``doubted`` frames, ``export``; counts."""
     load = partial(_frame, capture, out, AGREED)
     cloud, normals = fuse(names, load, capture.image)
     parts, count = (cloud.points_m, normals, cloud.colours), len(cloud.points_m)
@@ -81,11 +83,11 @@ def write_results(capture: Capture, out: Path, names: Sequence[str], export: Seq
         solved = capture.solve()
         seen = [solved.seen[capture.names.index(name)] for name in names]
         write_workspace(out / "colmap", map(load, names), capture.image, solved.points, seen)
-    _sheet(capture, out, names)
+    _sheet(capture, out, names, doubted)
     return {"cloud_points": count}
 
 
-def _sheet(capture: Capture, out: Path, names: Sequence[str]) -> None:
+def _sheet(capture: Capture, out: Path, names: Sequence[str], doubted: Sequence[str]) -> None:
     """A picture of evenly chosen frames and their depth, in the colours of one range where they are alike."""
     shown = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, ON_SHEET).astype(int))]
     depths, unit = [np.load(out / name / "depth.npy") for name in shown], capture.unit
@@ -94,7 +96,7 @@ def _sheet(capture: Capture, out: Path, names: Sequence[str]) -> None:
     cells: list[Image.Image] = []
     for name, figure in zip(shown, figures, strict=True):
         cells += [Image.fromarray(np.rint(capture.image(name) * 255).astype(np.uint8)), figure]
-    titles = [title for name in shown for title in (name, "depth")]
+    titles = [t for name in shown for t in (name, "depth, not trusted" if name in doubted else "depth")]
     with atomic_path(out / "sheet.jpg") as temporary:
         grid(cells, titles, columns=min(4, len(cells)), cell_width=360).save(temporary, quality=88)
 

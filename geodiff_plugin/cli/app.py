@@ -145,9 +145,9 @@ COMMANDS = {
     "info": Command(_Info, _later("cli.info.run_info"), "Versions, devices, priors and what is cached."),
     "bench": Command(_Bench, _later("cli.demo.run_bench"), "What guidance costs in seconds and memory."),
     "video": Command(_Video, _later("cli.outputs.run_video"), "Join depth maps of a sequence into a video."),
-    "submit": Command(_Submit, _later("cli.outputs.run_submit"), "Write what Middlebury and ETH3D take."),
+    "submit": Command(_Submit, _later("cli.outputs.run_submit"), "Write files for Middlebury and ETH3D."),
     "app": Command(_Page, _later("app.launch.run_app"), "Serve a web page to measure on (extra app)."),
-    "convert": Command(_Convert, _later("cli.convert.run_convert"), "Make a folder for --prior of weights."),
+    "convert": Command(_Convert, _later("cli.convert.run_convert"), "Convert weights to a --prior folder."),
     "eval": Command(None, lambda _: _imported("cli.eval.eval_app"), "Measure it and others on data sets."),
 }
 ABOUT = "Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior."

@@ -274,7 +274,8 @@ def capture_report(options: CaptureOptions) -> Record:
     seconds["frames"] = round(time.perf_counter() - started - seconds["poses"], 1)
     done = [report["frame"] for report in frames if report.get("status") != BROKEN]
     agreement = write_agreement(capture, options.out, done)
-    files = write_results(capture, options.out, done, options.export)
+    doubted = [report["frame"] for report in frames if not all(report.get("trusted", ()))]
+    files = write_results(capture, options.out, done, options.export, doubted)
     seconds["agreement and cloud"] = round(time.perf_counter() - started - sum(seconds.values()), 1)
     report = {
         "version": __version__,
@@ -285,6 +286,7 @@ def capture_report(options: CaptureOptions) -> Record:
         "seconds": seconds,
         "files": files,
         "agreement": agreement,
+        "not_trusted": doubted,
         "frames": frames,
     }
     write_text(options.out / "capture.json", json.dumps(report, indent=2) + "\n")
@@ -327,4 +329,6 @@ def summary(report: Record, out: Path) -> str:
     if depths:
         unit = "m" if report["unit"] else "units of the poses"
         line += f", median depth {depths[len(depths) // 2]:.2f} {unit}"
+    if doubted := report["not_trusted"]:
+        line += f"; NOT TRUSTED: {', '.join(doubted[:9])}{' ...' if doubted[9:] else ''}"
     return f"{line} -> {out}/"

@@ -128,9 +128,7 @@ class FigureOptions(SampleOptions):
 
     name: str = declare(MISSING, f"{', '.join(FIGURES)}.", "", metavar="NAME")
     max: float = declare(80.0, "gs-sweep: the last g_s, metres.", low=1.01, high=1e6)
-    updates: tuple[int, ...] = _list(
-        (1, 2, 5, 10, 20, 40), "inner-steps: updates per step.", low=1, high=10**4
-    )
+    updates: tuple[int, ...] = _list((1, 2, 5, 10, 20, 40), "inner-steps: updates a step.", low=1, high=10**4)
     results: Path | None = field(default=None)
     clouds: bool = declare(False, "qualitative, ablation: point clouds from another view too.")
 

@@ -23,9 +23,7 @@ LARGEST_MM, MILLIMETRES, KITTI_UNITS = 65535, 1000.0, 256.0
 #: Pixels of a strip: a map of float64 of so many is 8 MB.
 STRIP_PIXELS = 1 << 20
 MAP_FILES = "a map (H, W) as .npy, .npz, .pfm or 16-bit .png"
-KINDS = (
-    "a 16-bit PNG (millimetres), a .pfm or .npy map, or points as .npy, text, .ply or KITTI's .bin, in metres"
-)
+KINDS = "a 16-bit PNG (mm), a .pfm or .npy map, or points as .npy, text, .ply or KITTI's .bin, in metres"
 COLUMNS = (3, 4, 6)  # x y z, with an intensity, or with a colour
 NUMBER = re.compile(r"[-+]?(\d.*|\..*|nan|inf)", re.IGNORECASE)
 PLY_TYPES = {

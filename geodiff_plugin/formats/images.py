@@ -115,7 +115,7 @@ def read_image(path: PathLike, name: str = "left") -> tuple[np.ndarray, list[str
 def _hwc(value: Any, name: str) -> np.ndarray:
     """``(H, W, C)``, C of 1, 3 or 4, of an array with channels last or a tensor with channels first."""
     if not isinstance(value, (torch.Tensor, np.ndarray)):
-        bad_type(name, "a PIL image, a numpy array or a torch tensor", value)
+        bad_type(name, "a PIL image, a numpy array or a torch tensor", value, "Of a file: Image.open(path).")
     if isinstance(value, torch.Tensor):
         channels, shape, turn = 0, "(3, H, W)", "torch images start with channels: value.permute(2, 0, 1)."
     else:

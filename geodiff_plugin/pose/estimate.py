@@ -201,9 +201,7 @@ def _check_parallax(tracks: Tracks, near: np.ndarray, parallax: float, name: str
     """Refuse a camera that only turned: then every direction of a baseline explains the matches."""
     share = float((_rotation_residuals(tracks)[near] < INLIER_PX).mean())
     if share > SIMPLER or parallax < NO_PARALLAX_DEG:
-        got = (
-            f"a camera that only turned ({share:.0%} of the matches say so, parallax {parallax:.2f} degrees)"
-        )
+        got = f"a camera that only turned ({share:.0%} of matches say so, parallax {parallax:.2f} degrees)"
         cure = "Without a step to the side two photographs carry no depth."
         bad_value(name, "taken from two places", got, cure)
 

@@ -227,7 +227,7 @@ def _why_points(run: Indicators) -> str:
         )
     causes = [text for factor, text in FACTORS.items() if abs(math.log(ratio / factor)) < NEARLY]
     cause = causes[0] if causes else "a unit, the baseline or K may be off by that, or the points want a pose"
-    return f"The points lie {ratio:.3g} times as far as what both views match: {cause}."
+    return f"The points lie {float(f'{ratio:.3g}'):g} times as far as what both views match: {cause}."
 
 
 def _points_wrong(run: Indicators) -> bool:

@@ -23,6 +23,7 @@ from geodiff_plugin.cli.options import CaptureOptions
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.frames import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
+from geodiff_plugin.plotting import grid
 from geodiff_plugin.pose.capture import SolvedCapture, candidate_pairs, solve_capture
 from tests.cli.conftest import call
 from tests.unit.capture_room import FLIP, HALF, SIZE, K, perturbed, render, walk, write_transforms
@@ -273,6 +274,24 @@ def test_one_length_gives_all_and_without_one_nothing_says_metres(way, model, tm
     assert [frame["frame"] for frame in again["frames"]] == ["f02", "f04", "f06"]
     (tmp_path / "out/poses.npz").write_bytes(b"torn")
     assert run.load_solved(tmp_path / "out/poses.npz", "") is None
+
+
+def test_frames_that_are_not_trusted_are_named_and_marked(model, monkeypatch):
+    options, write, titles = model(), run._write_frame, list[str]()
+
+    def doubting(capture, options, loaded, item):
+        return write(capture, options, loaded, item) | {"trusted": [item.key != "f04"]}
+
+    def noting(cells, names, **how):
+        titles.extend(names)
+        return grid(cells, names, **how)
+
+    monkeypatch.setattr(run, "_write_frame", doubting)
+    monkeypatch.setattr("geodiff_plugin.capture.results.grid", noting)
+    report = run.capture_report(options)
+    assert report["not_trusted"] == ["f04"]
+    assert "; NOT TRUSTED: f04 -> " in run.summary(report, options.out)
+    assert titles == ["f02", "depth", "f04", "depth, not trusted", "f06", "depth"]
 
 
 @pytest.mark.parametrize(
