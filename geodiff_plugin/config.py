@@ -117,7 +117,7 @@ def _weights(default: Mapping[str, float]) -> Any:
 
 
 class UpdatePlan(NamedTuple):
-    """Gradient updates of a call: so many in each denoising step that makes any, with this step size.
+    """Gradient updates of a call: ``inner_steps`` in each denoising step that makes any.
 
     Steps that end by the fraction ``updates_from`` of the schedule make none.
     """

@@ -57,7 +57,7 @@ SHARE, NORMAL_QUANTILE = 0.8, 1.2816
 class _Observations(NamedTuple):
     """Matches against a map on their grid, ``(B, 1, h, w)`` each, and the links of that grid.
 
-    ``residual`` is the log of the factor on the map's inverse depth that a match asks for, ``noise`` its
+    ``residual`` is the log of a match's inverse depth over the map's, ``noise`` its
     standard deviation, ``weight`` confidence over relative variance, ``right_share (B, 1)`` the share of the
     weight that correct matches are expected to have, ``links`` are across and down, at a smoothness of 1.
     """

@@ -94,14 +94,14 @@ def _ends_of_image(
         ends = fit_to_points(x, evidence.points, metric, current)
         on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
     elif current is not None and reliable is not None and on_edge is not None:
-        # Later steps start from the first one's ends; reliable matches tell whether that basin still holds.
+        # Later steps start from the first one's ends; reliable matches show if that basin is still best.
         ends = current
     else:
         volume, bounds = evidence.volume, config.depth_range
         search = search_scale(volume, floored, space, depth_range=bounds, current=current, valid=valid)
         ends, on_edge = (search.near_m, search.far_m), search.on_edge
     if reliable is not None and evidence.matches is not None:
-        # A poor prior's true basin is shallow in raw costs; matches tell basins apart at a prior's error.
+        # A poor prior's true basin is shallow in raw costs; matches separate basins at that error.
         ends = refine_to_matches(floored, evidence.matches, *ends, space)
         ends = fit_to_points(x, reliable, metric, ends)
     for target in (evidence.matches, evidence.points):

@@ -22,7 +22,7 @@ from geodiff_plugin.guidance.evidence import EstimatedRig, EvidenceStore, estima
 from geodiff_plugin.guidance.inputs import read_inputs, split_views
 from geodiff_plugin.types import MetricDepthOutput, Rig
 
-#: What is assumed of a rectified pair whose right camera has no K of its own.
+#: The assumption about a rectified pair if only one K is given.
 SAME_CENTRE = (
     "The right camera's cx is assumed to be the left one's. If it is not, every depth is off: each pixel of "
     "difference (doffs) shifts all disparities by one. Give the right camera's cx, which is cx + doffs "
@@ -83,7 +83,7 @@ class GeometryGuidance:
     Convention:
         A rig whose right camera sits 0.12 m to the right has ``E[0, 3] == +0.12``.
 
-    Source: Algorithm 1, S4.2, S5.1; docs/reference/knobs.md explains defaults of our own.
+    Source: Algorithm 1, S4.2, S5.1; docs/reference/knobs.md explains the defaults.
     """
 
     estimated: EstimatedRig | None = None

@@ -40,8 +40,8 @@ _FLATTEST, _NOISE_OF_FLATTEST = 0.1, 1.0 / 0.77
 # Noise below the first number of grey levels does not disturb the matching and may be fine texture; noise
 # above the second is removed in full.
 _NOISE_RANGE = (1.7, 2.8)
-# Coefficients below so many steps, or so many standard deviations of the noise, are not the scene's. On
-# rendered pairs wrong matches are as few from half to twice these.
+# Coefficients below the first number of steps, or the second of noise deviations, are removed.
+# On rendered pairs wrong matches are equally few from half to twice these numbers.
 _STEPS, _DEVIATIONS = 1.2, 3.6
 # 16 of the 64 positions of the blocks, every row and column twice.
 _SHIFTS = tuple((i, (3 * i + k) % _BLOCK) for i in range(_BLOCK) for k in (0, _BLOCK // 2))

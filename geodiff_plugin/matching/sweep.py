@@ -40,7 +40,7 @@ class CostVolume:
 
     @property
     def cost(self) -> Tensor:
-        """``(D, H, W)`` float32 in [0, 1], the costs of all cells: four times the volume's own memory."""
+        """``(D, H, W)`` float32 in [0, 1], the costs of all cells, in four times the memory of ``levels``."""
         return self.levels.float() / COST_LEVELS
 
     def at_pixels(self, index: Tensor) -> tuple[Tensor, Tensor]:

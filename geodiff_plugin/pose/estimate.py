@@ -159,7 +159,7 @@ def _five_points(tracks: Tracks) -> np.ndarray:
 
 
 def _of_second_motion(tracks: Tracks, T: np.ndarray, inliers: np.ndarray, name: str) -> list[str]:
-    """Refuse, or report, a part of the scene that moved on its own: a second pose explains its matches.
+    """Refuse, or report, a part of the scene that moved: a second pose explains its matches.
 
     Wrong matches are explained by no pose. What moves along its epipolar lines cannot be seen in two
     photographs; it then lies at a wrong depth.

@@ -47,7 +47,7 @@ _CLEARLY, _AT_LEAST, _NEARLY = 2.0, 0.5, 0.85
 # lie this far from the given pose, in degrees or shares of the baseline, or have another K. If only the fine
 # shares distinguish it from the given pose, both must hold.
 _AS_EXACT, _FAR_DEG, _FAR_SHIFT = 1.2, 5.0, 0.8
-# Candidates whose share is this near the largest are told apart by a finer measure.
+# Among candidates whose share is this near the largest, a finer measure decides.
 _ALIKE = 0.95
 #: A longer baseline, with a scene as far away, may be in centimetres or millimetres.
 SUSPECT_BASELINE_M = 5.0

@@ -236,7 +236,7 @@ def fit_displacement(tracks: Tracks, T: np.ndarray, size: tuple[int, int]) -> Di
 
 
 def straightened(image_01: Tensor, displacement: Displacement) -> Tensor:
-    """The right image ``(C, H, W)`` with every pixel moved as a displacement of its own size says.
+    """The right image ``(C, H, W)`` warped by a displacement, which is scaled to its size.
 
     Its edge is repeated where nothing is seen; not differentiable.
     """
@@ -272,8 +272,8 @@ def _applied(
 def _sentences(tracks: Tracks, ask: Callable[..., str | None], *poses: np.ndarray) -> tuple[str, ...]:
     """The sentences of ``ask`` about every view that has matches, each once."""
     views = [(tracks.view(v), *of_view) for v, of_view in enumerate(zip(*poses, strict=True))]
-    said = [ask(*view) for view in views if len(view[0]) >= FEWEST]
-    return tuple(dict.fromkeys(sentence for sentence in said if sentence))
+    sentences = [ask(*view) for view in views if len(view[0]) >= FEWEST]
+    return tuple(dict.fromkeys(sentence for sentence in sentences if sentence))
 
 
 def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[str, ...]:

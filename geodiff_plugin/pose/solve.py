@@ -1,4 +1,4 @@
-"""Robust least squares over the poses of right cameras, under a prior that holds the given ones.
+"""Robust least squares over the poses of right cameras, under a prior centred on the given poses.
 
 Minimises, over 6 degrees of freedom a right view and one inverse depth a track,
     trust * sum log(1 + (residual / scale)^2)

@@ -1,4 +1,4 @@
-"""Diffusion depth priors, one a file, and how one is found by name; ``PRIORS`` lists them (S4)."""
+"""Diffusion depth priors, one file each; ``PRIORS`` lists them, ``find_prior`` finds one by name (S4)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from geodiff_plugin.scale.space import SPACES
 
 __all__ = ["BUNDLED_FOLDER", "PRIORS", "DepthPrior", "FoundPrior", "find_prior", "load_prior", "prior_of"]
 
-#: The first that recognises a folder takes it, so the more particular one stands before the more general.
+#: The first adapter that recognises a folder loads it, so specific ones stand before general ones.
 PRIORS: dict[str, type[DepthPrior]] = {
     "marigold-v2": MarigoldV2Pipeline,
     "geowizard": GeoWizardPipeline,
@@ -41,7 +41,7 @@ PRIORS: dict[str, type[DepthPrior]] = {
 
 
 def prior_of(pipe: Any) -> DepthPrior:
-    """What guidance asks of a live pipeline: itself, or its adapter in ``PRIORS``; else a ``TypeError``."""
+    """The ``DepthPrior`` of a live pipeline: itself, or its adapter in ``PRIORS``; else a ``TypeError``."""
     if isinstance(pipe, DepthDiffusionPipeline):
         return pipe
     for adapter in PRIORS.values():
@@ -53,14 +53,14 @@ def prior_of(pipe: Any) -> DepthPrior:
 
 @dataclass(frozen=True)
 class FoundPrior:
-    """A prior whose folder is recognised as of a ``key`` of ``PRIORS``; its weights are not read yet."""
+    """A prior's folder and the ``key`` of its adapter in ``PRIORS``; weights are read by ``load``."""
 
     key: str
     layout: Layout
 
     @property
     def licence(self) -> str:
-        """Of the weights, as the model card says; of a map, that of its model."""
+        """Licence of the weights, from the model card; of a map, that of its model."""
         return "that of the model which made the map" if self.key == "map" else self.layout.licence
 
     def load(
@@ -84,7 +84,7 @@ class FoundPrior:
 
 
 def find_prior(name: str | Path, variant: str | None = None, **hub: Any) -> FoundPrior:
-    """As ``load_prior``; a key of ``PRIORS`` and a colon before the name say which prior it is."""
+    """As ``load_prior``; ``KEY:NAME`` with a key of ``PRIORS`` chooses the adapter."""
     typed = str(name)
     if typed == MAP_LAYOUT.name:
         return FoundPrior("map", MAP_LAYOUT)
@@ -122,10 +122,10 @@ def load_prior(
     Args:
         name: ``"bundled"``, a folder, or a hub id (``prs-eth/marigold-depth-v1-1``); or ``"map"``, whose call
             takes the ``depth_map`` of another model.
-        device: where to, CPU for ``None``.
+        device: device of the networks, CPU for ``None``.
         dtype: of the networks.
-        space: what the prior's map is affine in, key of ``SPACES``; ``None`` for what the folder says, and of
-            ``"map"`` for depth.
+        space: what the prior's map is affine in, key of ``SPACES``; ``None`` for that of the folder, and for
+            depth with ``"map"``.
         **kwargs: ``variant`` of the weight files (``"fp16"``), and for the download ``revision``, ``token``,
             ``cache_dir``, ``local_files_only``.
 

@@ -1,4 +1,4 @@
-"""What guidance asks of a prior, and the loop of those that diffusers has no pipeline for (paper S4)."""
+"""``DepthPrior``, the interface of a prior; a denoising loop for priors without a diffusers pipeline (S4)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RESAMPLING = ("nearest", "nearest-exact", "bilinear", "bicubic", "area")
 
 
 def widened(x: Tensor) -> Tensor:
-    """Float32 of half precision; wider types as they are."""
+    """Half precision as float32; wider types unchanged."""
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
@@ -41,7 +41,7 @@ def map_of(picture: Tensor) -> Tensor:
 
 
 def stretched(maps: Tensor) -> Tensor:
-    """Maps ``(B, 1, H, W)`` each of which has a 0 and a 1."""
+    """Maps ``(B, 1, H, W)``, each stretched to [0, 1]."""
     low, high = maps.amin((1, 2, 3), keepdim=True), maps.amax((1, 2, 3), keepdim=True)
     return (maps - low) / (high - low).clamp_min(torch.finfo(maps.dtype).tiny)
 
@@ -56,33 +56,33 @@ def encode_picture(vae: Any, picture: Tensor) -> Tensor:
 def decode_picture(vae: Any, z0: Tensor) -> Tensor:
     """Scaled latents ``(B, C, h, w)`` as pictures ``(B, 3, H, W)``, about [-1, 1], float32 or wider.
 
-    Not clipped, as the pipelines' own endings are: that silences the gradient exactly at near and far.
+    Unlike in the stock pipelines it is not clipped: clipping has no gradient at near and far.
     """
     return widened(vae.decode((z0 / vae.config.scaling_factor).to(vae.dtype), return_dict=False)[0])
 
 
 @dataclass
 class DepthOutput(MarigoldDepthOutput):
-    """``MarigoldDepthOutput``, and further maps by name, such as ``"normals"``, of their own channels."""
+    """``MarigoldDepthOutput``, and further maps by name, such as ``"normals"``, of any channels."""
 
     extras: dict[str, np.ndarray | Tensor] = field(default_factory=dict)
 
 
 class DepthPrior:
-    """What guidance asks of a prior, which never sees a camera.
+    """Interface of a prior, which has no access to cameras.
 
-    A ``DepthDiffusionPipeline`` is one itself; for a pipeline of diffusers an adapter is written, as
+    A ``DepthDiffusionPipeline`` is a prior itself; a pipeline of diffusers needs an adapter, such as
     ``MarigoldPrior``.
 
     Attributes:
         config: of the pipeline; its ``prediction_type`` says what the decoded map is affine in.
-        max_steps: most denoising steps that make sense, ``None`` for any number. A guided call of a prior
-            with one step makes as many updates in it as it would have made in ``min_steps`` steps.
-        deterministic: the same image gives the same map, so that an ensemble has one member.
+        max_steps: upper bound on the denoising steps, ``None`` for none. Below ``min_steps`` a guided call
+            runs the rounds of all these steps within the allowed ones.
+        deterministic: the same image always gives the same map, so an ensemble has one member.
         takes_prompt: the call takes ``prompt_depth``, depths that the network starts from.
-        depth_channels: those of the scheduler's latents that are depth; no gradient step touches the others.
-        own_range: of a prior that is metric by itself, ``(N * E, 2)`` metres at 0 and at 1 of its maps.
-        valid: ``(N * E, 1, H, W)`` bool, where on the processing grid it says anything; ``None`` for all.
+        depth_channels: depth channels of the scheduler's latents; guidance does not change the others.
+        own_range: of a metric prior, ``(N * E, 2)`` metres at 0 and at 1 of its maps; else ``None``.
+        valid: ``(N * E, 1, H, W)`` bool, pixels of the processing grid with a prior depth; ``None`` for all.
     """
 
     config: Any
@@ -95,27 +95,27 @@ class DepthPrior:
 
     @property
     def space(self) -> str:
-        """What the decoded map is affine in, key of ``SPACES``; depth where the config does not say."""
-        said = self.config.get("prediction_type") or "depth"
-        return check_choice(said, "the pipeline's prediction_type", SPACES)
+        """What the decoded map is affine in, key of ``SPACES``; depth if the config has none."""
+        space = self.config.get("prediction_type") or "depth"
+        return check_choice(space, "the pipeline's prediction_type", SPACES)
 
     @property
     def network_input(self) -> slice | None:
-        """Channels of the network's first argument that are z_t; ``None`` where only its output is guided."""
+        """Channels of the network's first argument that are z_t; ``None`` if z_t is not an input."""
         raise NotImplementedError
 
     @staticmethod
     def recognises(layout: Layout) -> bool:
-        """Whether a folder is of this kind, by its component configs, never by ``_class_name``."""
+        """Whether a folder holds this prior, by its component configs and never by ``_class_name``."""
         return False
 
     @classmethod
     def load(cls, layout: Layout, dtype: torch.dtype, space: str | None) -> Any:
-        """The pipeline of a folder that it recognises; ``space`` is what the user said, or ``None``."""
+        """The pipeline of a recognised folder; ``space`` is the user's choice, or ``None``."""
         return build_pipeline(cls, layout, dtype, prediction_type=space)
 
     def network(self) -> tuple[Any, str]:
-        """Where the loop calls the network once a step: an object and the name of the method on it."""
+        """Object and name of the method by which the loop calls the network once a step."""
         raise NotImplementedError
 
     def decode(self, z0: Tensor) -> Tensor:
@@ -126,20 +126,20 @@ class DepthPrior:
         raise NotImplementedError
 
     def encode(self, x: Tensor) -> Tensor:
-        """About the inverse of ``decode``, of a map on the padded grid, beyond [0, 1] as far as it goes."""
+        """Approximate inverse of ``decode``, for a map on the padded grid, also beyond [0, 1]."""
         raise NotImplementedError
 
 
 class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
     """Depth of an image by a latent (or pixel) diffusion prior.
 
-    A subclass says how its network is called, by ``prepare_condition`` and ``denoise``, and overrides what
-    else it needs. Preprocessing, batching, ensembling and resizing are those of ``MarigoldDepthPipeline``,
-    as are the arguments of the call.
+    A subclass defines how its network is called, by ``prepare_condition`` and ``denoise``, and overrides
+    other methods if needed. Preprocessing, batching, ensembling, resizing and the arguments of the call are
+    those of ``MarigoldDepthPipeline``.
 
     Attributes:
-        sees_latents: whether the network is given the latents (else there is no z_t).
-        output_resampling: how its authors bring the map to the image's size.
+        sees_latents: whether latents are an input of the network (else there is no z_t).
+        output_resampling: how its authors resize the map to the image.
     """
 
     sees_latents = True
@@ -154,10 +154,10 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         image_processor: MarigoldImageProcessor | int = 8,
         **config: Any,
     ) -> None:
-        """The last line of a subclass's constructor, whose parameters these are.
+        """Register components and options; to be called last in a subclass's constructor.
 
-        ``image_processor`` resizes and pads, or is the number that padded sides are multiples of; ``config``
-        are further options to be saved.
+        ``image_processor`` resizes and pads; a number pads the sides to multiples of it. ``config`` are
+        further options to be saved.
         """
         self.register_modules(**modules)
         self.register_to_config(
@@ -178,7 +178,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         return self.depth_channels if self.sees_latents else None
 
     def network(self) -> tuple[Any, str]:
-        """``denoise``."""
+        """This pipeline and ``"denoise"``."""
         return self, "denoise"
 
     def prepare_condition(
@@ -190,15 +190,15 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         *args: Any,
         **options: Any,
     ) -> Condition:
-        """Every input of the network beside latents and time, ``N * E`` each, members side by side.
+        """All inputs of the network except latents and time, ``N * E`` each, members side by side.
 
-        Of images ``(N, 3, H, W)`` in [-1, 1], padded, of the pipeline's dtype, with E members each, in
-        batches; ``generator`` is for a prior that draws here, ``options`` are what it adds to the call.
+        ``image (N, 3, H, W)`` is in [-1, 1], padded, of the pipeline's dtype; E is ``ensemble_size``;
+        ``generator`` is for priors that draw samples here, ``options`` are further arguments of the call.
         """
         raise NotImplementedError
 
     def prepare_latents(self, condition: Condition, generator: Generators) -> Tensor:
-        """Initial latents shaped as ``condition["image_latent"]``: Gaussian, or zeros where none are seen."""
+        """Initial latents shaped as ``condition["image_latent"]``: Gaussian, or zeros if not used."""
         like = condition["image_latent"]
         if not self.sees_latents:
             return torch.zeros_like(like)
@@ -209,7 +209,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         self.scheduler.set_timesteps(num_inference_steps, device=device)
 
     def denoise(self, latents: Tensor, timestep: Tensor, condition: Condition) -> Tensor:
-        """The network's output as the scheduler's ``step`` takes it, of latents ``(B, C, h, w)``."""
+        """The network's output for latents ``(B, C, h, w)``, as the scheduler's ``step`` takes it."""
         raise NotImplementedError
 
     def decode_picture(self, z0: Tensor) -> Tensor:
@@ -217,7 +217,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         return decode_picture(self.vae, z0)
 
     def encode_picture(self, picture: Tensor) -> Tensor:
-        """About the inverse of ``decode_picture``, float32 or wider."""
+        """Approximate inverse of ``decode_picture``, float32 or wider."""
         return encode_picture(self.vae, picture)
 
     def decode(self, z0: Tensor) -> Tensor:
@@ -229,7 +229,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         return self.encode_picture(picture_of(x))
 
     def decode_prediction(self, latents: Tensor) -> Tensor:
-        """What the unguided call gives: ``(B, 1, H, W)`` in [0, 1]; override for an author's own ending."""
+        """Maps of the unguided call, ``(B, 1, H, W)`` in [0, 1]; override for the authors' last steps."""
         return self.decode(latents[:, self.depth_channels]).clamp(0.0, 1.0)
 
     def decode_extras(self, latents: Tensor, ensemble_size: int) -> dict[str, Tensor]:
@@ -258,7 +258,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         return latents * self.vae.config.scaling_factor
 
     def prompt_embedding(self, like: Tensor, words: str = "") -> Tensor:
-        """Embedding of a prompt, ``(len(like), n, C)``, not padded: so was Marigold trained."""
+        """Embedding of a prompt, ``(len(like), n, C)``, not padded, as in Marigold's training."""
         most = self.tokenizer.model_max_length
         tokens = self.tokenizer(words, max_length=most, truncation=True, return_tensors="pt")
         embedding = self.text_encoder(tokens.input_ids.to(like.device))[0]
@@ -299,8 +299,8 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
     ) -> DepthOutput | tuple[Any, ...]:
         """Estimate relative depth; arguments as ``MarigoldDepthPipeline`` takes them.
 
-        ``None`` for steps and resolution is the prior's own, for ``resample_method_output`` its authors'
-        (bilinear while guided). ``options`` are what this prior adds, see its ``prepare_condition``.
+        ``None`` for steps and resolution is the prior's default, for ``resample_method_output`` its authors'
+        choice (bilinear while guided). ``options`` are further arguments, those of ``prepare_condition``.
         """
         steps = self.default_denoising_steps if num_inference_steps is None else num_inference_steps
         resolution = processing_resolution
@@ -346,13 +346,13 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         return output if return_dict else (output.prediction, output.uncertainty, output.latent)
 
     def call_options(self) -> list[str]:
-        """What this prior adds to the call: the keywords of its ``prepare_condition``."""
+        """Further arguments of the call: the keywords of this prior's ``prepare_condition``."""
         common = inspect.signature(DepthDiffusionPipeline.prepare_condition).parameters
-        own = inspect.signature(self.prepare_condition).parameters
-        return [name for name, p in own.items() if name not in common and p.kind is not p.VAR_KEYWORD]
+        here = inspect.signature(self.prepare_condition).parameters
+        return [name for name, p in here.items() if name not in common and p.kind is not p.VAR_KEYWORD]
 
     def _start(self, condition: Condition, latents: Any, generator: Generators) -> Tensor:
-        """Latents as the caller gave them, or the prior's own."""
+        """Latents of the caller, checked, or those of ``prepare_latents``."""
         if latents is None:
             return self.prepare_latents(condition, generator)
         if not isinstance(latents, Tensor):
@@ -367,7 +367,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
     def _run_steps(
         self, latents: Tensor, condition: Condition, steps: int, batch_size: int, generator: Generators
     ) -> Tensor:
-        """Denoise the members ``(N * E, C, h, w)`` in chunks, each of which is a trajectory of its own."""
+        """Denoise the members ``(N * E, C, h, w)`` in chunks, each of which is one trajectory."""
         done = []
         for i in self.progress_bar(range(0, len(latents), batch_size), leave=True, desc="Depth predictions"):
             z = latents[i : i + batch_size]
@@ -382,7 +382,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
     def put_together(
         self, maps: Tensor, ensemble_size: int, output_uncertainty: bool, ensembling_kwargs: dict[str, Any]
     ) -> tuple[Tensor, Tensor | None]:
-        """Ensemble the members of every image: ``(N * E, 1, H, W)`` to ``(N, 1, H, W)`` and its spread."""
+        """Combine the members of every image, ``(N * E, 1, H, W)``, to ``(N, 1, H, W)`` and its spread."""
         if ensemble_size == 1:
             return maps, None
         pairs = [

@@ -29,7 +29,7 @@ BY_EVIDENCE = (-0.228, 0.788, 2.42, 0.0864, -15.0)
 _LEAST_DIFFERENCE, _MOST_DIFFERENCE = 0.01, 0.1
 _STRONG, _WEAK = 0.03, 0.15
 _LEAST_LEFT, _MOST_LEFT = 0.0005, 0.05
-# Errors in log depth: of the best prior that matches can tell apart, and of a useless one.
+# Errors in log depth: the least that matches can measure, and that of a useless prior.
 _BEST, _USELESS = 0.01, 0.5
 # Support at which the prior's error is half known: it is measured where there are matches, and a prior that
 # is right on the street may be wrong on the trees above it.

@@ -100,7 +100,7 @@ def _latent_of(vae: Any) -> tuple[int | None, int | None]:
 
 
 def tiny_autoencoder(pipe: Any, decoder: str) -> AutoencoderTiny | None:
-    """The autoencoder that ``decoder`` of ``GuidanceConfig`` names, frozen; ``None`` for the prior's own."""
+    """The autoencoder that ``decoder`` of ``GuidanceConfig`` names, frozen; ``None`` for the VAE."""
     if decoder == FULL:
         return None
     vae: Any = getattr(pipe, "vae", None)

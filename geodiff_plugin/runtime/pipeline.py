@@ -136,7 +136,7 @@ class GuidedCall(_Stock):
         return run, stock
 
     def _processing_grid(self, image: Any, call: dict[str, Any], device: torch.device) -> ProcessingGrid:
-        """The grid that the stock call will denoise on, found by its own preprocessing."""
+        """The grid that the stock call will denoise on, from the stock preprocessing."""
         resolution = call["processing_resolution"]
         resolution = self.default_processing_resolution if resolution is None else resolution
         preprocess = self.image_processor.preprocess

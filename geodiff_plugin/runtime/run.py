@@ -98,7 +98,7 @@ def plan_warm_start(
 
 
 def _noise(z0: Tensor, prior: DepthPrior, call: Mapping[str, Any], device: torch.device) -> Tensor:
-    """Noise for a latent: the call's own ``latents``, or drawn by its generator."""
+    """Noise for a latent: ``latents`` of the call, or drawn by its generator."""
     noise = call["latents"]
     if noise is None:
         depth = z0[:, prior.depth_channels]

@@ -23,7 +23,7 @@ CONFIDENT = 0.5
 #: Two images whose values differ by less, in [0, 1], and by less than this share of their contrast (all
 #: pictures that are nearly black differ by little), are the same picture.
 SAME, SAME_SHARE = 1.5 / 255, 0.05
-#: Points that are compared with matches: at least so many, each with matches this near, pixels of the grid.
+#: Least number of points that are compared with matches; radius in pixels in which a point has matches.
 FEWEST_COMPARED, REACH_PX = 12, 3
 FEWEST_MATCHES = 40
 #: A depth that differs from the matches by this in the median of the absolute log is not trusted.
@@ -40,7 +40,7 @@ LEAST_ORDER, MATCHED_ENOUGH = 0.2, 0.5
 #: Two weak indicators together count as a bad one; the last is the distance to epipolar lines, in pixels.
 WEAK_CONFIDENCE, WEAK_MATCHED = 0.6, 0.4
 WEAK_ORDER, WEAK_EPIPOLAR_PX = 0.45, 1.0
-#: A rank correlation says nothing of a scene whose matched depths lie within this (log of 95 % over 5 %).
+#: A low rank correlation is accepted if the matched depths lie within this (log of 95 % over 5 %).
 LEAST_SPREAD = 0.15
 #: Points and matches that differ by the first factor are reported; by the second, the result is not trusted.
 POINTS_REPORTED, POINTS_WRONG = math.log(1.08), math.log(1.2)
@@ -52,7 +52,7 @@ MANY_OFF, MOST_OFF = 0.25, 0.5
 LEAST_BASELINE_M, VIEWS_DEG = 1e-3, (15.0, 120.0)
 #: Wider than any lens without distortion, degrees.
 TOO_WIDE_DEG = 150.0
-#: Factor over a metric prior's own metres from which the difference is reported.
+#: A larger ratio of the result to a metric prior's depth is reported (log).
 OWN_METRES = math.log(1.9)
 #: Distance of matches from their epipolar lines, under the best pose near the given one, that is reported,
 #: and that is not trusted; pixels of the grid of the matches.
@@ -90,7 +90,7 @@ class Indicators:
     at_end: float = 0.0  # share of the confident matches on the first or the last plane of a given range
     baseline_m: float = 0.0  # distance of the first right camera; 0 without one, or where it has no unit
     view_deg: float = math.nan  # horizontal field of view that K gives the left image
-    own_ratio: float = math.nan  # of the depth over a metric prior's own, median
+    own_ratio: float = math.nan  # median of the depth over a metric prior's depth
     epipolar_px: float = math.nan  # median distance of matches from their epipolar lines, the worst view's
     off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
     doubts: tuple[str, ...] = ()  # warnings about the input, each of which forbids trust
