@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -71,7 +72,12 @@ def write_results(
     capture: Capture, out: Path, names: Sequence[str], export: Sequence[str], doubted: Sequence[str]
 ) -> dict[str, Any]:
     """Write, after ``write_agreement``, clouds, a sheet that marks ``doubted`` frames, ``export``; counts."""
-    load = partial(_frame, capture, out, AGREED)
+    unsure = set(doubted) if len(doubted) < len(names) else set()  # of these only what another frame confirms
+
+    def load(name: str) -> DepthFrame:
+        frame = _frame(capture, out, AGREED, name)
+        return replace(frame, asked=np.ones_like(frame.asked)) if name in unsure else frame
+
     cloud, normals = fuse(names, load, capture.image)
     parts, count = (cloud.points_m, normals, cloud.colours), len(cloud.points_m)
     write_vertices(out / "cloud.ply", "world frame", capture.unit, count, VERTEX, [parts])

@@ -277,7 +277,7 @@ def test_one_length_gives_all_and_without_one_nothing_says_metres(way, model, tm
 
 
 def test_frames_that_are_not_trusted_are_named_and_marked(model, monkeypatch):
-    options, write, titles = model(), run._write_frame, list[str]()
+    options, write, titles, lowest = model(), run._write_frame, list[str](), list[int]()
 
     def doubting(capture, options, loaded, item):
         return write(capture, options, loaded, item) | {"trusted": [item.key != "f04"]}
@@ -286,11 +286,17 @@ def test_frames_that_are_not_trusted_are_named_and_marked(model, monkeypatch):
         titles.extend(names)
         return grid(cells, names, **how)
 
+    def fusing(names, load, image):
+        lowest.extend(load(name).asked.min() for name in names)
+        return fuse(names, load, image)
+
     monkeypatch.setattr(run, "_write_frame", doubting)
+    monkeypatch.setattr("geodiff_plugin.capture.results.fuse", fusing)
     monkeypatch.setattr("geodiff_plugin.capture.results.grid", noting)
     report = run.capture_report(options)
     assert report["not_trusted"] == ["f04"]
     assert "; NOT TRUSTED: f04 -> " in run.summary(report, options.out)
+    assert lowest == [0, 1, 0]  # seen by no other frame; of a doubted one that is no excuse
     assert titles == ["f02", "depth", "f04", "depth, not trusted", "f06", "depth"]
 
 
