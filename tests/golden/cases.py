@@ -130,11 +130,6 @@ def preset_marigold_dc(left, right, K, E, depth) -> GeometryGuidance:
 
 
 @of_small()
-def preset_search_only(left, right, K, E, depth) -> GeometryGuidance:
-    return GeometryGuidance.search_only(right, K, E)
-
-
-@of_small()
 def gradient_updates(left, right, K, E, depth) -> GeometryGuidance:
     return GeometryGuidance(right, K, E, inner_steps=3, step_latents=0.03)
 

@@ -4,8 +4,7 @@
 
     python -m tests.parity.depthfm_reference --authors depth-fm --out tests/parity/fixtures/depthfm.npz
 
-The configurations below are what the parity test builds our pipeline from. Their code is imported, not
-copied; xformers is replaced by PyTorch's own attention, which computes the same.
+The parity test builds our pipeline from the configurations below; PyTorch's attention stands in for xformers.
 """
 
 import json

@@ -5,8 +5,7 @@ r"""Run DepthMaster's own code on tiny networks with named weights, and keep sli
     python -m tests.parity.depthmaster_reference --authors DepthMaster \
         --out tests/parity/fixtures/depthmaster.npz
 
-The configurations below are what the parity test builds our pipeline from. Their code is imported, not
-copied; torchvision is replaced by the two functions that are called.
+The parity test builds our pipeline from the configurations below; two functions stand in for torchvision.
 """
 
 import functools

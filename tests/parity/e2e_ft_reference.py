@@ -5,8 +5,7 @@
     python -m tests.parity.e2e_ft_reference --authors diffusion-e2e-ft/Marigold \
         --out tests/parity/fixtures/e2e_ft.npz
 
-The configurations below are what the parity test builds our pipeline from. Their code is imported, not
-copied; torchvision, which it imports for two functions, is replaced by what they do.
+The parity test builds our pipeline from the configurations below; two functions stand in for torchvision.
 """
 
 import string

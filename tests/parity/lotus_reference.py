@@ -4,8 +4,7 @@
 
     python -m tests.parity.lotus_reference --authors Lotus --out tests/parity/fixtures/lotus.npz
 
-The configurations below are what the parity test builds our pipeline from. Their code is imported, not
-copied; of torchvision it needs one function, given here as the torch function that it wraps.
+The parity test builds our pipeline from the configurations below; a torch function stands in for torchvision.
 """
 
 import tempfile
