@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import re
 import sys
 import tempfile
@@ -19,7 +20,7 @@ import numpy as np
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.app import look
-from geodiff_plugin.app.form import Form, build_form
+from geodiff_plugin.app.form import EXAMPLES, Form, build_form
 from geodiff_plugin.app.job import Priors, Stopped, run_job
 from geodiff_plugin.app.results import (
     NAMES,
@@ -77,10 +78,12 @@ def _forget(job: Job | None) -> None:
 
 
 def _uploads(options: DepthOptions) -> set[Path]:
-    """The folders of a visitor's uploads: gradio makes one a file. Examples of ours lie elsewhere."""
+    """The folders of a visitor's uploads; gradio names them by content, so examples are everybody's."""
     files = (*options.photographs().values(), *options.calib)
     temporary = Path(tempfile.gettempdir()).resolve()
-    return {path.parent for path in files if temporary in path.resolve().parents}
+    examples = [path for folder, _ in EXAMPLES for path in folder.iterdir()]
+    given = [path for path in files if temporary in path.resolve().parents]
+    return {p.parent for p in given if not any(filecmp.cmp(p, each, shallow=False) for each in examples)}
 
 
 def _delete(folders: Iterable[Path]) -> None:
@@ -188,7 +191,7 @@ def _wire_run(
     def leave(request: gr.Request) -> None:
         stop(request)
         stops.pop(request.session_hash)
-        _delete(folders.pop(request.session_hash, ()))
+        _delete(folders.pop(request.session_hash, set()).difference(*folders.values()))
 
     def nothing(status: str) -> dict[Any, Any]:
         """No result, and why."""

@@ -203,20 +203,17 @@ class Capture:
             bad_value("points", "of a COLMAP model", f"a capture of {self.files.kind}, which has none")
         if frame.points is None or frame.E is None:
             return None
-        T = np.linalg.inv(frame.E)
-        return (frame.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+        return _in_camera(frame.points, frame.E)
 
     def _tracked(self, number: int) -> np.ndarray | None:
         """``(n, 3)`` points of the solve in a frame's camera, those on which at least three frames agree."""
         solved = self.solve()
         if solved.status not in ADJUSTED or not solved.connected[number]:
             return None
-        frames = np.bincount(
-            np.concatenate([seen.point for seen in solved.seen]), minlength=len(solved.points)
-        )
-        xyz, T = solved.points[solved.seen[number].point], np.linalg.inv(solved.E[number])
-        xyz = xyz[frames[solved.seen[number].point] >= FEWEST_FRAMES] @ T[:3, :3].T + T[:3, 3]
-        ahead = xyz[xyz[:, 2] > 0].astype(np.float32)
+        every = np.concatenate([seen.point for seen in solved.seen])
+        seen, frames = solved.seen[number].point, np.bincount(every, minlength=len(solved.points))
+        xyz = _in_camera(solved.points[seen[frames[seen] >= FEWEST_FRAMES]], solved.E[number])
+        ahead = xyz[xyz[:, 2] > 0]
         return ahead if len(ahead) else None
 
     def measured_depth(self, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -255,6 +252,12 @@ class Capture:
         guidance = self.guidance(name, neighbours, **given | (knobs or {}))
         generator = torch.Generator("cpu").manual_seed(seed)
         return pipe(self.image(name), guidance=guidance, generator=generator, **call)
+
+
+def _in_camera(points: np.ndarray, E: np.ndarray) -> np.ndarray:
+    """World points ``(n, 3)`` in the frame of a camera, float32."""
+    T = np.linalg.inv(E)
+    return (points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
 
 
 def choose_neighbours(

@@ -262,7 +262,7 @@ class CaptureOptions(PriorOptions):
     points: str = declare(
         "tracks",
         "Known depths: tracks (points of the pose solve), none, model (points of a COLMAP model), depth "
-        "(maps it names).",
+        "(maps of the capture).",
         choices=POINTS,
     )
     metres_per_unit: float | None = _camera(None, "Metres of a unit of the poses.", above_0="metres")

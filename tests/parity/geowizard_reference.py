@@ -5,8 +5,7 @@
     python -m tests.parity.geowizard_reference --authors GeoWizard/geowizard \
         --out tests/parity/fixtures/geowizard.npz
 
-The configurations below are what the parity test builds our pipeline from. Their code is imported, not
-copied; torchvision's resize and xformers' attention are replaced by the torch functions they wrap.
+The parity test builds our pipeline from the configurations below; torch replaces torchvision and xformers.
 """
 
 import string

@@ -5,8 +5,7 @@
     python -m tests.parity.marigold_v2_reference --authors marigold-v2 \
         --out tests/parity/fixtures/marigold_v2.npz
 
-Their graph of one step is imported, not copied; their registry is replaced by a dictionary. The LoRA is put
-on by peft with their list of targets, and weights are loaded as they load them: not strictly.
+A dictionary replaces their registry. peft puts on the LoRA with their targets; weights load as theirs do.
 """
 
 import importlib.util

@@ -219,14 +219,17 @@ class TestWithGradio:
         asyncio.set_event_loop(None)  # what it leaves open is told here, not when all tests are done
         gc.collect()
 
-    def test_examples_are_whole_and_set_every_field(self, priors, gradio):
+    def test_examples_are_whole_and_set_every_field(self, priors, gradio, monkeypatch):
         from geodiff_plugin.app.form import EXAMPLES, build_form
+        from geodiff_plugin.app.page import _uploads
 
         with gradio.Blocks():
             form = build_form(priors)
         for number, (folder, _) in enumerate(EXAMPLES):
             options = form.options(tuple(form.example(number)))
             assert options.baseline is None and not options.estimate_pose
+            monkeypatch.setattr("tempfile.tempdir", str(folder.parent))  # gradio's copies lie there
+            assert not _uploads(options), "no visitor takes an example along"
             rig = read_calibration(options.calib)
             for path in options.photographs().values():
                 image, notes = read_image(path, "image")
