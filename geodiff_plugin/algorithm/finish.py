@@ -18,6 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin.algorithm.correction import highest
 from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.geometry import image_size, is_rectified, resize_intrinsics
 from geodiff_plugin.matching import Matches
@@ -57,6 +58,12 @@ MAP_VOTE, WEAK_PRIOR = 0.03, 0.2
 #: A match that differs from the map by this many errors of the prior counts for a quarter; the error used
 #: here is at most the second number.
 DIFFERS, ERROR_OF_VOTES = 2.0, 0.1
+#: Reach in which a step is looked for, and that beyond which it must not go on as a slope, pixels; the least
+#: step in log depth, and how much larger it may be within the wider reach.
+NEARBY, WIDE, EDGE, RISE = 4, 12, 0.1, 2.2
+#: Share of a step between two pixels that is crisp, and the least that is told apart; power with which a soft
+#: map raises the error of its prior at edges, and up to which error.
+CRISP, LEAST_CRISP, SOFT, MOST_SOFT = 0.8, 0.1, 4.0, 0.12
 #: Votes within about this many pixels of the median make the mean.
 NEAR_PX = 1.0
 #: Side of the last median filter, pixels of the voting grid.
@@ -179,6 +186,7 @@ def vote_depth(
         left[0], CameraView(right[0], K_right, view.T_right_from_left), K, float(nearest)
     )
     error = error.flatten()[0].clamp_min(1e-3)
+    error = torch.maximum(error, (error / _crispness(small_m) ** SOFT).clamp_max(MOST_SOFT))
     # The confidence of a known point is a count.
     votes = (
         _weigh_votes(of_rows, ROWS * matched + FILLED * filled, shift, error),
@@ -199,6 +207,21 @@ def _resized(image_01: Tensor, size: tuple[int, int]) -> Tensor:
     if image_size(image_01) == size:
         return image_01
     return F.interpolate(image_01, size, mode="bilinear", antialias=True)
+
+
+def _crispness(depth_m: Tensor) -> Tensor:
+    """``()`` in (0, 1]: the share of a step in a map ``(H, W)`` that lies between two pixels; 1 is crisp.
+
+    The median over edges: pixels with a step nearby that is not the slope of a wide surface.
+    """
+    log_depth = depth_m.clamp_min(1e-9).log()[None, None]
+    step = torch.zeros_like(log_depth)
+    step[..., 1:] = log_depth.diff(dim=-1).abs()
+    step[..., 1:, :] = torch.maximum(step[..., 1:, :], log_depth.diff(dim=-2).abs())
+    near, wide = (highest(log_depth, reach) + highest(-log_depth, reach) for reach in (NEARBY, WIDE))
+    at_edge = (near > EDGE) & (wide < RISE * near)
+    share = torch.where(at_edge, highest(step, NEARBY) / near, torch.nan).flatten().nanmedian()
+    return (share.nan_to_num(1.0) / CRISP).clamp(LEAST_CRISP, 1.0)
 
 
 def _weigh_votes(votes: Tensor, weight: Tensor, shift: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:

@@ -65,9 +65,8 @@ def solve_field(system: FieldSystem, steps: int, start: Tensor | None = None) ->
     if min(height, width) <= COARSEST_SIDE:
         return _conjugate_gradients(system, torch.zeros_like(system.pull), COARSEST_STEPS)
     coarse = solve_field(system.coarser(), steps)
-    coarse = coarse.repeat_interleave(2, -2).repeat_interleave(2, -1)[..., :height, :width]
-    blurred = F.avg_pool2d(F.pad(coarse, (1, 1, 1, 1), mode="replicate"), 3, 1)
-    return _conjugate_gradients(system, blurred, steps)
+    fine = F.interpolate(coarse, scale_factor=2, mode="bilinear")[..., :height, :width]
+    return _conjugate_gradients(system, fine, steps)
 
 
 def _conjugate_gradients(system: FieldSystem, x: Tensor, steps: int) -> Tensor:

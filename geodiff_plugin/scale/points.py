@@ -27,7 +27,7 @@ BASIN_REACH = 4.0
 #: its cost is within this factor of the best.
 BASIN_CAUCHY, BASIN_KEEP = 32.0, 1.05
 #: Reweighted Gauss-Newton steps on near and far; upper bound on the matches of the fit.
-FIT_ITERATIONS, FIT_SAMPLES = 12, 20_000
+FIT_ITERATIONS, FIT_SAMPLES = 12, 8000
 #: Standard deviation of a match of confidence .96, planes; least one of the map's residuals, log depth.
 FIT_NOISE, FIT_FLOOR = 0.5, 4e-3
 #: Width of the Cauchy weight, in standard deviations of match and map together.
