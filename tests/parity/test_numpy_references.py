@@ -172,7 +172,7 @@ class Fit:
         def robust(left_over):
             return weight / (1 + left_over**2 / (DEFAULT.outlier_width**2 * (self.noise**2 + error**2)))
 
-        return self.solve(self.residual, weight, 400.0, 1.3e-3 * 400, robust, 4)[0]
+        return self.solve(self.residual, weight, 400.0, 1.3e-3 * 400, robust, 3)[0]
 
     def spread(self, residual):
         """Standard deviation of residuals beyond the noise, by the 80 % quantile of right matches."""
@@ -218,7 +218,7 @@ def test_a_correction_is_three_passes_of_weighted_least_squares(fit, error):
         least = 1e-4 ** (1 - k / 2) * 5e-4 ** (k / 2)
         inertia = max(min(0.015 * (0.05 / error) ** 4, 0.03), least)
         smoothness = first ** (1 - k / 2) * last ** (k / 2)
-        part, weight = fit.solve(fit.residual - total, weight, smoothness, inertia, robust, 3)
+        part, weight = fit.solve(fit.residual - total, weight, smoothness, inertia, robust, 2)
         total += part
     depth, target, left = fit.torch()
     refined, _, field = correction.refine_depth(depth, target, left, torch.full((1, 1, 1, 1), error))

@@ -38,7 +38,7 @@ def guided(pipe, pair, **knobs):
 @pytest.mark.parametrize("kind", ["zoedepth", "glpn", "tipsv2", "depth_pro"])
 def test_a_run_says_how_far_the_priors_metres_were_off(kind, textured_plane):
     out = guided(knowing(kind, textured_plane.depth_m, factor=0.5), textured_plane)
-    assert out.own_scale.shape == (1, 1) and float(out.own_scale) == pytest.approx(2.0, rel=0.015)
+    assert out.own_scale.shape == (1, 1) and float(out.own_scale) == pytest.approx(2.0, rel=0.02)
     assert any("2 times the prior's own metres" in sentence for sentence in out.warnings)
     assert np.median(out.prediction[0, ..., 0] / textured_plane.depth_m) == pytest.approx(1.0, rel=0.01)
 
