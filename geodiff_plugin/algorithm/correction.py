@@ -52,8 +52,6 @@ EDGE_ERROR = 0.11
 #: The prior's error is this quantile of the correct matches' residuals over the normal distribution's: the
 #: median would miss that a fifth of the scene is on a wrong surface.
 SHARE, NORMAL_QUANTILE = 0.8, 1.2816
-#: Upper bound on the pixels whose residuals are sorted.
-MOST_SORTED = 20_000
 
 
 class _Observations(NamedTuple):
@@ -181,29 +179,21 @@ def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: Guid
 
     rounds, inertia = REWEIGHTINGS + 1, STIFF_INERTIA * stiff
     return solve_robust(
-        _scaled(observed.links, stiff),
-        observed.residual,
-        inertia,
-        trusted,
-        robust,
-        rounds,
-        SOLVER_STEPS,
+        _scaled(observed.links, stiff), observed.residual, inertia, trusted, robust, rounds, SOLVER_STEPS
     )[0]
 
 
 def _spread(residual: Tensor, observed: _Observations) -> Tensor:
-    """``(B, 1, 1, 1)`` robust standard deviation of residuals, less the noise of their matches.
+    """``(B, 1, 1, 1)`` robust standard deviation of residuals, less their matches' noise, within bounds.
 
-    The largest residuals are left out, as many as matches are expected to be wrong.
+    The largest residuals are left out, as many as matches are expected to be wrong. No match: ``MOST_ERROR``.
     """
-    every = max(1, residual[0].numel() // MOST_SORTED)
-    weight, noise, apart = (
-        each.flatten(1)[:, ::every] for each in (observed.weight, observed.noise, residual.abs())
-    )
-    largest = weighted_quantile(apart, weight, SHARE * observed.right_share)
-    noise = weighted_quantile(noise, weight, 0.5)
-    beyond = ((largest / NORMAL_QUANTILE) ** 2 - noise**2 / 4.0).clamp_min(0.0).sqrt() * (weight.sum(1) > 0)
-    return beyond.view(-1, 1, 1, 1)
+    weight = observed.weight.flatten(1)
+    largest = weighted_quantile(residual.abs().flatten(1), weight, SHARE * observed.right_share)
+    noise = weighted_quantile(observed.noise.flatten(1), weight, 0.5)
+    beyond = ((largest / NORMAL_QUANTILE) ** 2 - noise**2 / 4.0).clamp_min(0.0).sqrt()
+    beyond = torch.where(weight.sum(1) > 0, beyond, MOST_ERROR)
+    return beyond.view(-1, 1, 1, 1).clamp(LEAST_ERROR, MOST_ERROR)
 
 
 @torch.no_grad()
@@ -221,15 +211,9 @@ def prior_error(
     side = max(1, round(BLOCK * max(height, width)))
     rows, columns = (torch.arange(n, device=depth_m.device) // side for n in (height, width))
     black = ((rows[:, None] + columns[None]) % 2).to(observed.residual.dtype)
-    first = _bounded(_spread(observed.residual, observed))
+    first = _spread(observed.residual, observed)
     predicted = [_stiff(observed, observed.weight * colour, first, config) for colour in (black, 1.0 - black)]
-    error = _spread(torch.where(black > 0, predicted[1], predicted[0]) - observed.residual, observed)
-    matched = observed.weight.flatten(1).amax(1).view(-1, 1, 1, 1) > 0
-    return torch.where(matched, _bounded(error), torch.full_like(error, MOST_ERROR))
-
-
-def _bounded(error: Tensor) -> Tensor:
-    return error.clamp(LEAST_ERROR, MOST_ERROR)
+    return _spread(torch.where(black > 0, predicted[1], predicted[0]) - observed.residual, observed)
 
 
 @torch.no_grad()

@@ -215,9 +215,8 @@ def _crispness(depth_m: Tensor) -> Tensor:
     The median over edges: pixels with a step nearby that is not the slope of a wide surface.
     """
     log_depth = depth_m.clamp_min(1e-9).log()[None, None]
-    step = torch.zeros_like(log_depth)
-    step[..., 1:] = log_depth.diff(dim=-1).abs()
-    step[..., 1:, :] = torch.maximum(step[..., 1:, :], log_depth.diff(dim=-2).abs())
+    across, down = (log_depth.diff(dim=axis).abs() for axis in (-1, -2))
+    step = torch.maximum(F.pad(across, (1, 0)), F.pad(down, (0, 0, 1, 0)))
     near, wide = (highest(log_depth, reach) + highest(-log_depth, reach) for reach in (NEARBY, WIDE))
     at_edge = (near > EDGE) & (wide < RISE * near)
     share = torch.where(at_edge, highest(step, NEARBY) / near, torch.nan).flatten().nanmedian()

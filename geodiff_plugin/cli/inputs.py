@@ -54,9 +54,7 @@ class Inputs:
 
 
 def read_inputs(
-    options: DepthOptions,
-    frames: Sequence[np.ndarray] | None = None,
-    names: tuple[str, str] | None = None,
+    options: DepthOptions, frames: Sequence[np.ndarray] | None = None, names: tuple[str, str] | None = None
 ) -> Inputs:
     """Read images and cameras of checked options, and see that they fit each other.
 

@@ -65,11 +65,6 @@ def _to_blocks(levels: Tensor, basis: Tensor) -> Tensor:
     return basis @ whole.reshape(rows, _BLOCK, columns, _BLOCK).transpose(1, 2) @ basis.T
 
 
-def _from_blocks(coefficients: Tensor, basis: Tensor) -> Tensor:
-    rows, columns = coefficients.shape[:2]
-    return (basis.T @ coefficients @ basis).transpose(1, 2).reshape(rows * _BLOCK, columns * _BLOCK)
-
-
 def _table(like: Tensor) -> Tensor:
     return torch.tensor(_LUMA_STEPS, device=like.device, dtype=like.dtype).view(_BLOCK, _BLOCK)
 
@@ -148,6 +143,7 @@ def clean(image_01: Tensor, grid_pixels: int) -> Tensor:
     total = torch.zeros_like(levels)
     for row, column in _SHIFTS:
         blocks = _to_blocks(wide[row:, column:], basis)
-        kept = _from_blocks(blocks * (blocks.abs() >= threshold), basis)
+        kept = basis.T @ (blocks * (blocks.abs() >= threshold)) @ basis
+        kept = kept.transpose(1, 2).flatten(2, 3).flatten(0, 1)
         total += kept[_BLOCK - row :, _BLOCK - column :][:height, :width]
     return (image_01 + (total / len(_SHIFTS) - levels) / 255.0).clamp(0.0, 1.0)

@@ -14,8 +14,6 @@ from geodiff_plugin.matching.census import COST_LEVELS
 from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.sweep import UNSEEN_LEVEL, CostVolume
 
-#: Distance from the truth, in planes, up to which a match counts as right.
-RIGHT_WITHIN_PLANES = 3.0
 #: Log-odds that a checked match is right, linear in its evidence, by logistic regression on pairs with truth
 #: (``python -m tests.benchmarks.confidence`` refits them).
 LOG_ODDS = (5.8, 0.8, -5.9, -0.62)
@@ -134,7 +132,7 @@ def match_volume(volume: CostVolume) -> Matches:
     """Matches of a cost volume: aggregate, take the winner, and check it against every right view.
 
     Confidence is 0 where no right view agrees, else about the probability that the match is within
-    ``RIGHT_WITHIN_PLANES`` of the truth, by the right view that is most certain of it.
+    three planes of the truth, by the right view that is most certain of it.
     """
     inverse_depth, contrast, views = candidates(volume, volume.aligned)
     confidence = torch.zeros_like(inverse_depth)

@@ -159,10 +159,5 @@ def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
 
 
 def _window_mean(x: Tensor, radius: int) -> Tensor:
-    """Mean over a square window, with zeros beyond the border, from running sums along both axes."""
     side = 2 * radius + 1
-    for axis in (-1, -2):
-        padded = F.pad(x, (radius + 1, radius, 0, 0) if axis == -1 else (0, 0, radius + 1, radius))
-        total, length = padded.cumsum(axis), x.shape[axis]
-        x = (total.narrow(axis, side, length) - total.narrow(axis, 0, length)) / side
-    return x
+    return F.avg_pool2d(F.avg_pool2d(x, (1, side), 1, (0, radius)), (side, 1), 1, (radius, 0))

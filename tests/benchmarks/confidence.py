@@ -187,7 +187,7 @@ def observe_matches(sample: StereoSample, settings: Settings, priors: PriorCache
     truth_m = F.interpolate(truth, volume.size, mode="nearest-exact")[0, 0].numpy()
     known = (agreed & textured).cpu().numpy() & (truth_m > 0)
     error = np.abs(inverse_depth.cpu().numpy() - 1.0 / np.where(truth_m > 0, truth_m, 1.0))
-    right = error <= consistency.RIGHT_WITHIN_PLANES * float(volume.plane_step)
+    right = error <= 3.0 * float(volume.plane_step)
     return _drawn(evidence.cpu().numpy(), right, known, settings.seed)
 
 
