@@ -63,7 +63,7 @@ DIFFERS, ERROR_OF_VOTES = 2.0, 0.1
 NEARBY, WIDE, EDGE, RISE = 4, 12, 0.1, 2.2
 #: Share of a step between two pixels that is crisp, and the least that is told apart; power with which a soft
 #: map raises the error of its prior at edges, and up to which error.
-CRISP, LEAST_CRISP, SOFT, MOST_SOFT = 0.8, 0.1, 4.0, 0.12
+CRISP, LEAST_CRISP, SOFT, MOST_SOFT = 0.8, 0.1, 4.0, 0.14
 #: Votes within about this many pixels of the median make the mean.
 NEAR_PX = 1.0
 #: Side of the last median filter, pixels of the voting grid.
