@@ -212,15 +212,15 @@ def _resized(image_01: Tensor, size: tuple[int, int]) -> Tensor:
 def _crispness(depth_m: Tensor) -> Tensor:
     """``()`` in (0, 1]: the share of a step in a map ``(H, W)`` that lies between two pixels; 1 is crisp.
 
-    The median over edges: pixels with a step nearby that is not the slope of a wide surface.
+    The median over edges: pixels inside with a step nearby that is not the slope of a wide surface.
     """
     log_depth = depth_m.clamp_min(1e-9).log()[None, None]
     across, down = (log_depth.diff(dim=axis).abs() for axis in (-1, -2))
     step = torch.maximum(F.pad(across, (1, 0)), F.pad(down, (0, 0, 1, 0)))
     near, wide = (highest(log_depth, reach) + highest(-log_depth, reach) for reach in (NEARBY, WIDE))
     at_edge = (near > EDGE) & (wide < RISE * near)
-    share = torch.where(at_edge, highest(step, NEARBY) / near, torch.nan).flatten().nanmedian()
-    return (share.nan_to_num(1.0) / CRISP).clamp(LEAST_CRISP, 1.0)
+    share = torch.where(at_edge, highest(step, NEARBY) / near, torch.nan)[..., WIDE:-WIDE, WIDE:-WIDE]
+    return (share.flatten().nanmedian().nan_to_num(1.0) / CRISP).clamp(LEAST_CRISP, 1.0)
 
 
 def _weigh_votes(votes: Tensor, weight: Tensor, shift: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:

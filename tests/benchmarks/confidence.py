@@ -286,10 +286,7 @@ def main(
             observe_matches,
             ("matching/consistency.py", "LOG_ODDS", MATCH_SIGNS, consistency.LOG_ODDS),
         ),
-        "depth": (
-            observe_depth,
-            ("runtime/confidence.py", "BY_EVIDENCE", SIGNS, confidence.BY_EVIDENCE),
-        ),
+        "depth": (observe_depth, ("runtime/confidence.py", "BY_EVIDENCE", SIGNS, confidence.BY_EVIDENCE)),
     }
     settings = [
         Settings(prior=one, ensemble=ensemble, resolution=resolution, device=device)

@@ -65,11 +65,7 @@ class Axis:
 #: The grids of losses and sweep grow with the picture here, which by default they do up to a bound.
 AXES = (
     Axis("longer side of the picture, px", (256, 512, 1024), lambda n: {"side": n}),
-    Axis(
-        "planes of the sweep, at most",
-        (32, 64, 128),
-        lambda n: {"knobs": {"planes": n}},
-    ),
+    Axis("planes of the sweep, at most", (32, 64, 128), lambda n: {"knobs": {"planes": n}}),
     Axis("further views", (1, 2, 4), lambda n: {"views": n}),
     Axis("denoising steps", (4, 8, 16), lambda n: {"options": {"num_inference_steps": n}}),
     Axis("members of the ensemble", (1, 2, 4), lambda n: {"options": {"ensemble_size": n}}),

@@ -23,14 +23,7 @@ from diffusers.utils import logging as diffusers_logging
 
 from geodiff_plugin.runtime.machine import PeakMemory, pick_device, timed
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
-from tests.benchmarks.operations import (
-    WAYS,
-    Size,
-    call_of,
-    calls_of_all,
-    count_operations,
-    tiny_folder,
-)
+from tests.benchmarks.operations import WAYS, Size, call_of, calls_of_all, count_operations, tiny_folder
 from tests.benchmarks.random_marigold import random_marigold
 
 __all__ = ["Found", "main", "measure"]

@@ -29,12 +29,7 @@ from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runtime.estimate import TINY, tiny_autoencoder
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from tests.benchmarks.full_sizes import UNET, VAE
-from tests.benchmarks.random_marigold import (
-    EMPTY_PROMPT_TOKENS,
-    narrowed,
-    random_marigold,
-    random_tiny,
-)
+from tests.benchmarks.random_marigold import EMPTY_PROMPT_TOKENS, narrowed, random_marigold, random_tiny
 
 __all__ = [
     "WAYS",

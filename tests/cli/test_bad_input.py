@@ -65,6 +65,7 @@ FILES: dict[str, Any] = dict.fromkeys(EMPTY, "") | {
     "empty.csv": "\n",
     "short.csv": "a.png\n",
     "pairs.csv": "left.png,right.png\n",
+    "two.csv": "left.png,right.png\nthird.png,right.png\n",
     "mine/pairs.csv": "left.png,right.png\n",
     "drive.mcap": b"\0" * 99,
     # other commands

@@ -30,11 +30,7 @@ def error_of(output) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("depth_map", "space", "most"),
-    [
-        (7 / TRUTH - 1e3, "disparity", 0.005),
-        (SMALL, "depth", 0.01),
-    ],
+    ("depth_map", "space", "most"), [(7 / TRUTH - 1e3, "disparity", 0.005), (SMALL, "depth", 0.01)]
 )
 def test_a_map_becomes_metric(depth_map, space, most):
     output = guided(depth_map, space)

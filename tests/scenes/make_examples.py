@@ -29,10 +29,7 @@ def render_examples(folder: Path = FOLDER) -> None:
             values = (pixels.permute(1, 2, 0) * 255).round().to(torch.uint8).numpy()
             Image.fromarray(values).save(target / f"{side}.jpg", quality=90, subsampling=0, optimize=True)
         K = pair.K_left.numpy()
-        f, cx, cy = (
-            K[0, 0] / RAYS_PER_SIDE,
-            *((K[:2, 2] + 0.5) / RAYS_PER_SIDE - 0.5),
-        )
+        f, cx, cy = (K[0, 0] / RAYS_PER_SIDE, *((K[:2, 2] + 0.5) / RAYS_PER_SIDE - 0.5))
         camera = f"[{f:.6g} 0 {cx:.6g}; 0 {f:.6g} {cy:.6g}; 0 0 1]"
         lines = (f"cam0={camera}", f"cam1={camera}", "doffs=0", f"baseline={1000 * baseline_m:g}")
         text = "\n".join((*lines, f"width={WIDTH}", f"height={HEIGHT}", "ndisp=64")) + "\n"

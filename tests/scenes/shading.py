@@ -10,14 +10,7 @@ from dataclasses import dataclass
 
 import torch
 
-from tests.scenes.lighting import (
-    Lighting,
-    SurfacePoints,
-    ambient_light,
-    direct_light,
-    sky_radiance,
-    unit,
-)
+from tests.scenes.lighting import Lighting, SurfacePoints, ambient_light, direct_light, sky_radiance, unit
 from tests.scenes.patterns import LAYERS
 from tests.scenes.primitives import surface
 from tests.scenes.scene import Material

@@ -11,11 +11,7 @@ from transformers.models.auto.modeling_auto import MODEL_FOR_DEPTH_ESTIMATION_MA
 
 from geodiff_plugin.priors import find_prior, load_prior, prior_of
 from geodiff_plugin.priors.components import DirectScheduler
-from geodiff_plugin.priors.transformers_depth import (
-    NO_DEPTH,
-    TransformersDepthPipeline,
-    output_of,
-)
+from geodiff_plugin.priors.transformers_depth import NO_DEPTH, TransformersDepthPipeline, output_of
 from tests.contracts.tiny_transformers import MODELS, make_transformers
 
 OUTPUTS = {

@@ -13,14 +13,7 @@ from tests.scenes.layouts.palettes import palette, pick, surface_look
 from tests.scenes.layouts.spot import Spot
 from tests.scenes.scene import Material
 
-__all__ = [
-    "cabinet",
-    "counter",
-    "desk_things",
-    "monitor",
-    "shelf",
-    "table",
-]
+__all__ = ["cabinet", "counter", "desk_things", "monitor", "shelf", "table"]
 
 
 def table(spot: Spot, width: float, depth: float, height: float, look: Look, legs: str = "posts") -> None:
