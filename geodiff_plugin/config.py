@@ -145,16 +145,13 @@ class GuidanceConfig:
         depth_range: bounds of the sweep and of the nearest and farthest depth of the search.
         pose: poses that do not fit the matches are refined ([poses](../how-to/poses.md#given-poses)).
         clean_photographs: JPEG blocks and strong sensor noise are removed before photographs are compared;
-            the prior sees the image as it is, except with `--distortion`, which undistorts cleaned
-            photographs.
-        decoder: what decodes and encodes between the steps
-            ([priors](../reference/priors.md#a-tiny-decoder)).
+            the prior sees the image as it is, but for `--distortion`, which undistorts cleaned ones.
+        decoder: decodes and encodes between the steps ([priors](../reference/priors.md#a-tiny-decoder)).
         eta: SSIM against L1 in the photometric term (Eq. 14).
         pyramid_levels: levels of the image pyramid of the photometric term.
         exposure: photographs are compared in the left one's exposure: gain and bias per channel and a slow
             field, in closed form.
-        z_test: pixels that the estimate occludes in a right camera take no part in the photometric term of
-            updates.
+        z_test: pixels occluded in a right camera take no part in the photometric term of updates.
         min_visible: share in view below which the photometric term is off.
         pull_to: what `prior_pull` pulls s_hat, t_hat towards (Eq. 17): the search's result, or 0.
         points_loss: error at points: Cauchy in inverse depth, in units of 1 % of the points' median, or

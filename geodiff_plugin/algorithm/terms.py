@@ -207,9 +207,8 @@ def points_term(compared: Compared) -> Tensor:
 def prior_pull_term(compared: Compared) -> Tensor:
     """``||s_hat - s*||^2 + ||t_hat - t*||^2``, to be weighted by gamma.
 
-    Source: Eq. 17, with ``pull_to="zero"``. Deviation: by default s*, t* are the search's result, because the
-        paper's pull of the raw values towards 0 makes softplus(0) = 0.693 of both: far / near = 2 for every
-        scene.
+    Source: Eq. 17, with ``pull_to="zero"``. Deviation: by default s*, t* are the search's result: a pull of
+        the raw values towards 0 makes softplus(0) = 0.693 of both: far / near = 2 for every scene.
     """
     s, t = compared.affine.s_hat, compared.affine.t_hat
     if compared.config.pull_to == "start":

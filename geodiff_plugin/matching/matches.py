@@ -153,11 +153,13 @@ def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
     spread = spread.nan_to_num(LARGEST).clamp_min(SPREAD_FLOOR)
     least = (SPREADS * spread).clamp_min(LEAST_DISTANCE)[:, None, None, None]
     radius = max(1, round(REGION * max(depth_m.shape[-2:])))
-    region = _window_mean(behind * weight, radius) / _window_mean(weight, radius).clamp_min(1e-6)
+    region = _window_sum(behind * weight, radius) / _window_sum(weight, radius).clamp_min(1.0)
     rejected = ((torch.minimum(region, behind) / least - 1.0) / (MULTIPLE - 1.0)).clamp(0.0, 1.0)
     return 1.0 - rejected
 
 
-def _window_mean(x: Tensor, radius: int) -> Tensor:
-    side = 2 * radius + 1
-    return F.avg_pool2d(F.avg_pool2d(x, (1, side), 1, (0, radius)), (side, 1), 1, (radius, 0))
+def _window_sum(x: Tensor, radius: int) -> Tensor:
+    for _ in range(2):  # along rows, then along columns
+        until = F.pad(F.pad(x.cumsum(-1), (0, radius, 0, 0), mode="replicate"), (radius + 1, 0))
+        x = (until[..., 2 * radius + 1 :] - until[..., : -2 * radius - 1]).mT
+    return x
