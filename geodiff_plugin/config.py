@@ -134,13 +134,10 @@ class GuidanceConfig:
     The tables of knobs take their sentences from here.
 
     Attributes:
-        gradient: `full` goes through the U-Net to z_t; `denoised` stops at the clean latent and moves that:
-            no U-Net backward.
+        gradient: `full` goes through the U-Net to z_t; `denoised` stops at the clean latent and moves that.
         weights: the terms of the loss; a term of weight 0 costs nothing (gamma of Eq. 17 is `prior_pull`).
         min_steps: denoising steps when the call names none and the pipeline's default is lower.
         respace: a leading DDIM schedule runs as trailing while guided.
-        warm_start: share of the schedule that a call with `previous`, the output of the previous frame,
-            skips; 0 takes over the scale alone ([sequences](../how-to/sequences.md)).
         sweep_pixels: upper bound on the pixels of the grid of matches, corrections and losses.
         depth_range: bounds of the sweep and of the nearest and farthest depth of the search.
         pose: poses that do not fit the matches are refined ([poses](../how-to/poses.md#given-poses)).
@@ -170,8 +167,7 @@ class GuidanceConfig:
             updates; with `gradient="denoised"` only (after SteeredMarigold, Gregorek and Nalpantidis 2024).
         corrections: upper bound on the number of steps (or rounds of a one-step prior) that are corrected:
             the last, and the others spread over the second half of the schedule where they fit.
-        even_ensemble: median of an even number of members: the mean of the two middle ones, or the lower
-            (Marigold-DC).
+        even_ensemble: median of an even number: mean of the two middle ones, or the lower (Marigold-DC).
         crisp: the result is finished at full resolution
             ([dataflow](../explanation/dataflow.md#how-edges-become-crisp)).
         smoothness: weight of the correction's slope against a match of full confidence, on a grid 512 pixels
@@ -200,7 +196,6 @@ class GuidanceConfig:
     weights: Mapping[str, float] = _weights(DEFAULT_WEIGHTS)
     min_steps: int = _number(4, 1, 1000, int, paper="{}, not given")
     respace: bool = _flag(True)
-    warm_start: float = _number(0.25, 0.0, 0.99, paper="-")
     sweep_pixels: int = _number(210_000, 1024, 1 << 32, int, paper="{} (768 px, S9)")
     depth_range: tuple[float, float] | None = _pair(
         None, paper="-", unset="from the nearest plane to a shift of 0.3 px"

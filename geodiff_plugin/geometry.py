@@ -187,8 +187,7 @@ def sample_at(image: Tensor, uv: Tensor, *, mode: str = "bilinear") -> Tensor:
     """Values ``(B, C, h, w)`` of an image ``(B, C, H, W)`` at ``uv (B, h, w, 2)`` pixels, its edge repeated.
 
     Convention:
-        (0, 0) is the centre of the first pixel. A ``uv`` that grows by 1 in its first component reads one
-        pixel further right.
+        (0, 0) is the centre of the first pixel; the first component of ``uv`` grows to the right.
     """
     height, width = image.shape[-2:]
     # align_corners=True: -1 and 1 are the centres of the first and the last pixel, where uv counts from.

@@ -1,8 +1,7 @@
 """The arithmetic between a network's output, the clean latent and the noise, for every prediction type.
 
-The Tweedie line of Algorithm 1, Eq. 6 (eq:tweedie), divides by sqrt(alpha_bar), which is 0 at the first step
-of a zero-terminal-SNR schedule, and its sign fits a score, not a noise prediction. These are the formulas of
-the schedulers.
+Eq. 6 (eq:tweedie) of Algorithm 1 divides by sqrt(alpha_bar), which is 0 at the first step of a
+zero-terminal-SNR schedule, and its sign fits a score, not noise. These are the formulas of the schedulers.
 """
 
 from __future__ import annotations

@@ -20,11 +20,10 @@ class Round(NamedTuple):
 class Schedule:
     """The rounds of every denoising step of a guided call that runs; an empty entry leaves a step unchanged.
 
-    ``skipped`` is the number of steps before them that a warm start omits; ``moves``: rounds move latents.
+    With ``moves``, rounds move latents.
     """
 
     steps: tuple[tuple[Round, ...], ...]
-    skipped: int = 0
     moves: bool = True
 
     def is_last(self, step: int) -> bool:
@@ -36,9 +35,7 @@ class Schedule:
         return self.moves and any(r.corrects or r.updates for r in self.steps[step])
 
     def __str__(self) -> str:
-        lines = [
-            f"step {i + 1}: skipped, as the call starts from the previous frame" for i in range(self.skipped)
-        ]
+        lines = []
         for i, rounds in enumerate(self.steps):
             actions = [
                 " and ".join(
@@ -48,7 +45,7 @@ class Schedule:
                 for r in rounds
             ]
             last = ", last" if self.is_last(i) else ""
-            lines.append(f"step {self.skipped + i + 1}: {'; '.join(actions) or 'leave'}{last}")
+            lines.append(f"step {i + 1}: {'; '.join(actions) or 'leave'}{last}")
         return "\n".join(lines)
 
 
@@ -67,15 +64,9 @@ def count_steps(wanted: int, requested: int | None, most: int | None) -> tuple[i
 
 
 def make_schedule(
-    config: GuidanceConfig,
-    plan: UpdatePlan,
-    steps: int,
-    *,
-    rounds: int = 1,
-    skipped: int = 0,
-    encodes: bool = True,
+    config: GuidanceConfig, plan: UpdatePlan, steps: int, *, rounds: int = 1, encodes: bool = True
 ) -> Schedule:
-    """The schedule of ``steps`` steps with ``rounds`` rounds each, after ``skipped`` steps of a warm start.
+    """The schedule of ``steps`` steps with ``rounds`` rounds each.
 
     Early estimates are vague, and later corrections replace what earlier ones did. So the last active round
     is corrected, and the others are spread over the second half of the active rounds, or over more of them if
@@ -83,12 +74,12 @@ def make_schedule(
     the same step: a second fit to the same matches would follow their noise. Nothing is
     corrected unless a map can be encoded (``encodes``), which it cannot while guidance moves z_t.
     """
-    count = (skipped + steps) * rounds
+    count = steps * rounds
     active = [i for i in range(count) if config.start <= i / count < config.stop]
     corrects = config.correct and config.optimize_latents and encodes
     chosen = _spread(active, config.corrections) if corrects and active else set()
     made = []
-    for step in range(skipped, skipped + steps):
+    for step in range(steps):
         current: list[Round] = []
         fresh = False  # corrected, and not moved since
         for i in range(step * rounds, (step + 1) * rounds):
@@ -102,7 +93,7 @@ def make_schedule(
         made.append(tuple(current))
     if not any(made):  # the output needs a scale, even if no step corrects or moves anything
         made[-1] = (Round(False, 0),)
-    return Schedule(tuple(made), skipped, config.optimize_latents)
+    return Schedule(tuple(made), config.optimize_latents)
 
 
 def _spread(active: list[int], wanted: int) -> set[int]:

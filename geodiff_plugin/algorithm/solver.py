@@ -1,7 +1,6 @@
 """Weighted least squares of a smooth field on an image grid, coarse to fine.
 
-A screened Poisson equation, solved by conjugate gradients on a pyramid (cascadic multigrid, Bornemann and
-Deuflhard 1996).
+A screened Poisson equation, solved on a pyramid (cascadic multigrid, Bornemann and Deuflhard 1996).
 """
 
 from __future__ import annotations

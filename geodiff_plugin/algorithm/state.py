@@ -26,9 +26,9 @@ class Trajectory:
     """State of one chunk of samples through the schedule.
 
     ``owners`` is the image of each sample; samples of one image lie side by side. The scale search starts
-    from ``prior_range``, a metric prior's metres ``(B,)`` at ``x = 0`` and ``x = 1``, or ``start_range``, the
-    nearest and the farthest depth of the previous frame. Where ``valid (B, 1, h, w)`` bool is false the prior
-    gives no depth: there its map does not count for the scale, and matches alone decide.
+    from ``prior_range``, a metric prior's metres ``(B,)`` at ``x = 0`` and ``x = 1``. Where
+    ``valid (B, 1, h, w)`` bool is false the prior gives no depth: there its map does not count for the scale,
+    and matches alone decide.
     """
 
     affine: AffineState  # after the latest update; set by ``settle_scale``
@@ -47,7 +47,6 @@ class Trajectory:
         space: str,
         step_latents: float = 0.0,
         prior_range: tuple[Tensor, Tensor] | None = None,
-        start_range: tuple[Tensor, Tensor] | None = None,
         valid: Tensor | None = None,
     ) -> None:
         self.config, self.owners, self.valid = config, list(owners), valid
@@ -64,10 +63,7 @@ class Trajectory:
         self.scale_rule, self.shift_rule = (RULES[config.rule](config.step_affine) for _ in range(2))
         # Sorted into nearest and farthest: for disparity x = 1 is the nearest.
         self._prior_range = None if prior_range is None else tuple(torch.stack(prior_range).sort(0).values)
-        self._start_range = self._prior_range if start_range is None else start_range
         self._affine_start: AffineState | None = None  # the search's result, which the loss pulls towards
-        if start_range is not None:  # found by the search of the previous frame
-            self.on_edge = torch.zeros_like(start_range[0], dtype=torch.bool)
         self.history: list[StepReport] = []
         self.watch = FiniteWatch()
         self.step: tuple[int, float] = (0, 0.0)
@@ -91,7 +87,7 @@ class Trajectory:
         """Search g_s and the start of scale and shift for a relative map (S7.3), or improve those in use."""
         is_first = self._affine_start is None
         if self.config.search == "volume":
-            ends = self._start_range if is_first else self.metric.range_of(self.affine)
+            ends = self._prior_range if is_first else self.metric.range_of(self.affine)
             near, far, self.on_edge = settle_ends(
                 x, self.owners, self._evidence, self.metric, self.config, ends, self.on_edge, self.valid
             )

@@ -191,8 +191,7 @@ def points_term(compared: Compared) -> Tensor:
     """Error at depths that the user knows (lidar, structure from motion, a tape).
 
     ``points_loss="robust"`` is the Cauchy loss of the matches: a wrong point does not win against the rest.
-    ``"l1l2"``, mean absolute plus mean squared error in metres, is that of Marigold-DC (Viola et al. 2024,
-    Eq. 4).
+    ``"l1l2"``, mean absolute plus squared error in metres, is Marigold-DC's (Viola et al. 2024, Eq. 4).
     """
     target = compared.points
     assert target is not None  # Term.needs

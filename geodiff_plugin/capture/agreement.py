@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
+import cv2
 import numpy as np
+
+from geodiff_plugin.pose.tracks import match_features, sift_features
 
 #: Two depths of one point agree within this share.
 SAME_SHARE = 0.06
@@ -17,6 +21,10 @@ LEAST_WEIGHT = 0.05
 RISES = 0.4
 #: So many other frames must agree with each other to replace a depth that none of them confirms.
 OUTVOTES = 2
+#: Frames before and after a frame of a video that it is checked against.
+STEADY = 3
+#: The motion of a camera is known if so many matches fit it, to within so many pixels.
+LEAST_INLIERS, INLIER_PX = 20, 1.5
 Maps = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -140,3 +148,58 @@ def _vote(rendered: Sequence[tuple[np.ndarray, np.ndarray]], mask: np.ndarray) -
         better, by_these = weight > best[1], (same.sum(0), weight, mean, sure)
         best = [np.where(better, new, old) for new, old in zip(by_these, best, strict=True)]
     return best[0].astype(np.uint8), best[1], best[2], best[3]
+
+
+def scene_poses(frames: Iterable[tuple[DepthFrame, np.ndarray]]) -> list[list[np.ndarray]]:
+    """Camera-to-world poses of a video's frames from their matches and depth, a list for every scene.
+
+    Frames, whose poses do not count, come in order, each with its picture ``(H, W, 3)`` in [0, 1]. Where no
+    motion fits, another scene begins. A scene's world is the camera of its first frame.
+    """
+    scenes, before = list[list[np.ndarray]](), None
+    for frame, picture in frames:
+        features = sift_features(np.rint(255.0 * picture.mean(-1)).astype(np.uint8))
+        T = None if before is None else _motion(*before, features[0], match_features(before[1], features))
+        if T is None:
+            scenes.append([np.eye(4)])
+        else:
+            scenes[-1].append(scenes[-1][-1] @ np.linalg.inv(T))
+        before = frame, features
+    return scenes
+
+
+def _motion(
+    frame: DepthFrame, of_frame: tuple[np.ndarray, np.ndarray], following: np.ndarray, pairs: np.ndarray
+) -> np.ndarray | None:
+    """``T (4, 4)`` from a frame's camera to the following one's; ``None`` where too few matches fit one."""
+    if len(pairs) < LEAST_INLIERS:
+        return None
+    px, seen = of_frame[0][pairs[:, 0], :2], following[pairs[:, 1], :2]
+    column, row = np.rint(px).astype(int).clip(0, np.array(frame.depth.shape[::-1]) - 1).T
+    points = np.c_[px, np.ones(len(px))] @ np.linalg.inv(frame.K).T * frame.depth[row, column, None]
+    fits, turn, shift, inliers = cv2.solvePnPRansac(points, seen, frame.K, None, reprojectionError=INLIER_PX)
+    if not fits or len(inliers) < LEAST_INLIERS:
+        return None
+    at = inliers[:, 0]
+    turn, shift = cv2.solvePnPRefineLM(points[at], seen[at], frame.K, None, turn, shift)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+    return T
+
+
+def steadied(
+    scenes: Sequence[Sequence[np.ndarray]], load: Callable[[int], DepthFrame]
+) -> Iterator[DepthFrame]:
+    """Every frame of a video in order, agreed with those before and after it in its scene.
+
+    ``scenes`` are of ``scene_poses``, and ``load`` gives a frame by its number, its pose left out.
+    """
+    poses = [(number, E) for number, scene in enumerate(scenes) for E in scene]
+
+    @lru_cache(maxsize=2 * STEADY + 1)
+    def posed(i: int) -> DepthFrame:
+        return replace(load(i), E=poses[i][1])
+
+    for i, (scene, _) in enumerate(poses):
+        near = range(max(0, i - STEADY), min(len(poses), i + STEADY + 1))
+        yield agreed(posed(i), [posed(j) for j in near if j != i and poses[j][0] == scene])

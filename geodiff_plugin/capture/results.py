@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.capture.agreement import DepthFrame, agreed
+from geodiff_plugin.capture.agreement import DepthFrame, agreed, scene_poses, steadied
 from geodiff_plugin.capture.capture import Capture, choose_neighbours
 from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb, write_vertices
 from geodiff_plugin.formats.depth import write_depth_mm, write_depth_npy
@@ -52,20 +52,55 @@ def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[s
     load = lru_cache(maxsize=2 * OTHERS)(partial(_frame, capture, out, ALONE))
     for name in names:
         others = [load(capture.names[i]) for i in choose_neighbours(solved, number[name], OTHERS, there)]
-        frame, folder = agreed(load(name), others), out / name
+        frame = agreed(load(name), others)
         assert frame.confirmed is not None and frame.asked is not None
-        write_depth_npy(folder / "depth.npy", frame.depth)
-        write_depth_mm(folder / "depth_mm.png", frame.depth)
-        depth_figure(frame.depth, unit=capture.unit).save(folder / "depth.png")
-        for file in AGREED[1:]:
-            with atomic_path(folder / f"{file}.npy") as temporary:
-                np.save(temporary, getattr(frame, file))
+        _write_agreed(out / name, frame, capture.unit)
         shares[name] = {
             "checked_against": len(others),
             "confirmed": round(float((frame.confirmed > 0).mean()), 4),
             "unconfirmed": round(float(((frame.asked > 0) & (frame.confirmed == 0)).mean()), 4),
         }
     return shares
+
+
+def _write_agreed(folder: Path, frame: DepthFrame, unit: str | None) -> None:
+    write_depth_npy(folder / "depth.npy", frame.depth)
+    write_depth_mm(folder / "depth_mm.png", frame.depth)
+    depth_figure(frame.depth, unit=unit).save(folder / "depth.png")
+    for file in AGREED[1:]:
+        with atomic_path(folder / f"{file}.npy") as temporary:
+            np.save(temporary, getattr(frame, file))
+
+
+def write_steady(frames: Iterable[tuple[Path, np.ndarray, np.ndarray]], unit: str | None) -> int:
+    """Write what finished frames of a video agree on with their neighbours; the number of its scenes.
+
+    Of each its folder, picture ``(H, W, 3)`` in [0, 1] and ``K (3, 3)``. Its depth by its own run is kept as
+    ``ALONE``, so the same call again changes nothing.
+    """
+    known = list[tuple[Path, np.ndarray]]()
+
+    def each() -> Iterable[tuple[DepthFrame, np.ndarray]]:
+        for folder, picture, K in frames:
+            known.append((folder, K))
+            yield _alone(folder, K), picture
+
+    scenes = scene_poses(each())
+    for (folder, _), frame in zip(known, steadied(scenes, lambda i: _alone(*known[i])), strict=True):
+        _write_agreed(folder, frame, unit)
+    return len(scenes)
+
+
+def _alone(folder: Path, K: np.ndarray) -> DepthFrame:
+    """A frame by its own run, which is kept beside what takes its place."""
+    if not (folder / f"{ALONE[1]}.npy").is_file():
+        depth, path = np.load(folder / "depth.npy"), folder / "confidence.npy"
+        confidence = np.load(path) if path.is_file() else np.full_like(depth, 0.5)
+        for alone, values in zip(ALONE, (depth, confidence), strict=True):
+            with atomic_path(folder / f"{alone}.npy") as temporary:
+                np.save(temporary, values)
+    depth, confidence = (np.load(folder / f"{alone}.npy") for alone in ALONE)
+    return DepthFrame(folder.name, depth, confidence, K, np.eye(4))
 
 
 def write_results(

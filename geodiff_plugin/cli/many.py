@@ -15,9 +15,11 @@ import numpy as np
 import torch
 from rich.text import Text
 
-from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin._checks import InputError, bad_value, noted
 from geodiff_plugin._threads import WithinCores
+from geodiff_plugin.capture.results import write_steady
 from geodiff_plugin.cli.depth import Job, load_guided_prior
+from geodiff_plugin.cli.inputs import read_inputs
 from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, start_pair
 from geodiff_plugin.cli.outputs import read_report
 from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, options_of, start_many
@@ -47,7 +49,7 @@ JOURNAL = ".pairs.jsonl"
 #: A table of more pairs than this has only those that want to be looked at.
 MOST_ROWS = 20
 #: Options that a result does not depend on.
-NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "strict", "device", "encoding"}
+NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "strict", "steady", "device", "encoding"}
 #: Behind an error, they say that the next pair cannot be written either.
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 Row = dict[str, Any]
@@ -98,10 +100,13 @@ class Stages:
             job = Job(options, held.enter_context(folder))
         digests = _digests(options)  # before: what changes later is another version
         job.entries = {"pair": {"name": ref.name, "frame": ref.frame, "sha256": digests}}
-        job.read(None if ref.frame is None else self._frames(ref, ref.frame))
+        job.read(self.views(ref))
         return job
 
-    def _frames(self, ref: PairRef, frame: int) -> Sequence[np.ndarray]:
+    def views(self, ref: PairRef) -> Sequence[np.ndarray] | None:
+        """Left and right view of a pair of frames; ``None`` for one of files."""
+        if (frame := ref.frame) is None:
+            return None
         for path in {ref.left, ref.right or ref.left} - set(self._videos):
             bag = (self._options.bag_topics(), self._options.tolerance) if is_bag(path) else None
             reader: Any = VideoReader(path) if bag is None else BagReader(path, *bag)
@@ -239,8 +244,26 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
         stages.close()
     answers = [_final(record, there.get(record["key"]), options) for record in records]
     if process.index == 0:
+        if options.steady:
+            _make_steady(options, refs, Stages(options, device), options.out)
         _answer(answers, options, options.out)
     return any(row["result"] == "failed" for row in answers)
+
+
+def _make_steady(options: DepthOptions, refs: Sequence[PairRef], stages: Stages, out: Path) -> None:
+    """Depth of every finished frame, averaged with that of its neighbours where they agree."""
+    reports = [(ref, report) for ref in refs if (report := read_report(out / ref.name))]
+
+    def frames() -> Iterator[tuple[Path, np.ndarray, np.ndarray]]:
+        for ref, report in reports:
+            with noted():  # what is to be warned of was, by the run of the pair
+                left = read_inputs(options_of(ref, options), stages.views(ref)).left
+            yield out / ref.name, left, np.reshape(report["K"], (3, 3))
+
+    count = write_steady(frames(), reports[0][1]["unit"]) if reports else 0
+    stages.close()
+    if count > 1 and not options.quiet:
+        say(f"--steady: depth is averaged within {count} scenes; no motion of the camera leads between them.")
 
 
 def _final(record: Row, there: Row | None, options: DepthOptions) -> Row:

@@ -80,6 +80,7 @@ class DepthOptions(RunOptions):
     topic_right: str | None = declare(None, "Topic of the right images, where LEFT is a bag.", "--right")
     tolerance: float = declare(0.005, "A bag: most seconds between the stamps of a pair.", low=0.0, high=10.0)
     encoding: str = _output("16UC1", "A bag: 16UC1 is whole mm, 32FC1 metres.", choices=("16UC1", "32FC1"))
+    steady: bool = _output(False, "Frames in order: average the depth of neighbours where they agree.")
     min_confidence: float = _output(0.0, "Least confidence of a point in the cloud, 0 to 1.", low=0, high=1)
     out: Path | None = _output(None, "Folder; geodiff-out, or -2 and so on if taken.", "--out", "-o")
     overwrite: bool = _output(False, "Write into a folder that holds files; do finished pairs anew.")

@@ -292,8 +292,7 @@ def run_video(frames: Sequence[Path], out: Path, fps: float, near: float | None,
 def run_submit(results: Sequence[Path], to: str, out: Path, method: str) -> None:
     """Write a disparity map and a time for every result; the folder of its left image names the scene.
 
-    Source: upload-format.html of Middlebury's evaluation, version 3; ETH3D's documentation, "Result
-        submission".
+    Source: upload-format.html of Middlebury's evaluation 3; "Result submission" in ETH3D's documentation.
     """
     if to == "middlebury" and not method.isalnum():
         bad_value("--method", "letters and digits", repr(method))

@@ -14,16 +14,14 @@ from scipy.spatial import cKDTree
 
 from geodiff_plugin import __version__
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.capture.agreement import DepthFrame, agreed, seen_in
+from geodiff_plugin.capture.agreement import DepthFrame, agreed, scene_poses, seen_in, steadied
 from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.experiment import Page, run_experiment
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.options import CAPTURE_ROWS, WAYS, CaptureEvalOptions, SequenceOptions
 from geodiff_plugin.evaluation.tables import CellOf, Table, grouped, mean_of, most_of, table_of_groups
-from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.guidance.inputs import left_images
 from geodiff_plugin.runner import Item, Record, fingerprint
 
 #: What makes a sequence, by name; a checkout registers its renderer (tests/scenes/dataset.py).
@@ -64,7 +62,7 @@ def run_sequence(name: str, options: SequenceOptions) -> Page | None:
     if "synthetic" not in SEQUENCES:
         cure = "A clone of the repository has them: python -m tests.scenes eval sequence ..."
         bad_value("the sequences", "registered in evaluation.frames.SEQUENCES as 'synthetic'", "none", cure)
-    settings, priors, store = options.settings, PriorCache(), EvidenceStore(options.frames)
+    settings, priors = options.settings, PriorCache()
     pipe, prior = priors.get(settings), priors.fingerprint(settings)
 
     @lru_cache(maxsize=1)
@@ -75,36 +73,35 @@ def run_sequence(name: str, options: SequenceOptions) -> Page | None:
     for seed, way in product(range(options.scenes), options.ways):
         how = (options.frames, *options.size, options.steps, options.seed, settings.device)
         key = fingerprint(seed, way, *how, settings.prior, prior, __version__)
-        work = partial(_measure_sequence, pipe, render, seed, way, options, store)
+        work = partial(_measure_sequence, pipe, render, seed, way, options)
         cells.append(Item(key, work, name=f"sequence {seed}, {way}", head={"seed": seed, "way": way}))
     of = f"{options.frames} frames, {options.size[1]}x{options.size[0]} pixels, prior {settings.prior}"
     remark = f"{options.scenes} rendered scenes of {of}, {options.steps} steps, seed {options.seed} each."
     return run_experiment(name, options, "Sequences", cells, sequence_tables, lambda _: [remark])
 
 
-def _measure_sequence(
-    pipe: Any, render: Any, seed: int, way: str, options: SequenceOptions, store: EvidenceStore
-) -> Record:
+def _measure_sequence(pipe: Any, render: Any, seed: int, way: str, options: SequenceOptions) -> Record:
     """AbsRel, flicker and seconds a frame of one way of going through a sequence."""
-    sequence, (_, share, warm) = render(seed), WAYS[way]
+    sequence, (_, share, steady) = render(seed), WAYS[way]
     steps = max(1, round((options.steps or 1) * share))
     device, truth = pipe._execution_device, true_frames(sequence)
     clock = time.process_time if device.type == "cpu" else time.perf_counter
-    errors, scores, before, seconds = [], [], None, 0.0
-    for left, right, true in zip(sequence.lefts, sequence.rights, truth, strict=True):
-        knobs: dict[str, Any] = {} if warm is None else {"previous": before, "warm_start": warm}
-        guidance = GeometryGuidance(right.image_01, sequence.K.numpy(), sequence.E.numpy(), **knobs)
-        guidance.evidence_store = store
-        with torch.no_grad():
-            guidance.prepare(left_images(left.image_01).to(device))  # the same for every way, so not timed
+    frames, pictures, started = [], [], clock()
+    for left, right in zip(sequence.lefts, sequence.rights, strict=True):
+        guidance = GeometryGuidance(right.image_01, sequence.K.numpy(), sequence.E.numpy())
         generator = torch.Generator("cpu").manual_seed(options.seed)
-        call = {"num_inference_steps": steps, "generator": generator, "output_latent": True}
-        started = clock()
-        before = pipe(left.image_01, guidance=guidance, **call)  # its result is numpy: nothing is pending
-        seconds += clock() - started
-        depth_m = before.prediction[0, ..., 0]
-        scores.append(evaluate_depth(depth_m, true.depth, np.isfinite(true.depth))["abs_rel"])
-        errors.append(np.log(depth_m / true.depth))
+        call = {"num_inference_steps": steps, "generator": generator}
+        out = pipe(left.image_01, guidance=guidance, **call)  # its result is numpy: nothing is pending
+        maps = out.prediction[0, ..., 0], out.confidence[0, ..., 0]
+        frames.append(DepthFrame("", *maps, sequence.K.numpy().astype(np.float64), np.eye(4)))
+        pictures.append(left.image_01.permute(1, 2, 0).numpy())
+    if steady:
+        frames = list(steadied(scene_poses(zip(frames, pictures, strict=True)), frames.__getitem__))
+    seconds = clock() - started
+    known = [np.isfinite(true.depth) for true in truth]
+    each = zip(frames, truth, known, strict=True)
+    scores = [evaluate_depth(frame.depth, true.depth, there)["abs_rel"] for frame, true, there in each]
+    errors = [np.log(frame.depth / true.depth) for frame, true in zip(frames, truth, strict=True)]
     moved, breath = flicker(errors, truth)
     numbers = {"abs_rel": float(np.mean(scores)), "worst": float(np.max(scores)), "flicker": moved}
     return {"kind": sequence.kind} | numbers | {"breath": breath, "seconds": seconds / len(truth)}
@@ -125,7 +122,7 @@ def sequence_tables(records: Sequence[Record]) -> list[Table]:
     note = (
         "AbsRel in metres, without alignment. Flicker: mean absolute change of log depth of the same surface "
         "point from one frame to the next, beyond that of the truth, in per cent; breathing: the same of the "
-        "frame's median. Seconds of a guided call without its evidence; on a CPU those of all its threads."
+        "frame's median. On a CPU seconds are those of all threads."
     )
     return [table_of_groups("From frame to frame", records, ("way",), _SEQUENCE_COLUMNS, note)]
 

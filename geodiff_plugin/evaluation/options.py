@@ -20,14 +20,11 @@ FIGURES = ("gs-sweep", "inner-steps", "ablation", "exposure", "qualitative")
 #: Emulated priors: mean absolute error of log depth, whether the map is blurred, its exponent, 1 for none.
 STRENGTHS = {f"{percent}%": (percent / 100, False, 1.0) for percent in (2, 5, 10, 20)}
 STRENGTHS = {"exact": (0.0, False, 1.0), **STRENGTHS, "blur": (0.01, True, 1.0), "gamma": (0.0, False, 1.6)}
-#: How frames follow each other: title, share of the steps, and ``warm_start``, ``None`` for alone.
+#: How frames are made: title, share of the steps, whether neighbours are averaged where they agree.
 WAYS = {
-    "alone": ("each frame alone", 1.0, None),
-    "alone-half": ("each frame alone, half the steps", 0.5, None),
-    "scale": ("scale of the frame before", 1.0, 0.0),
-    "warm": ("warm start, a quarter left out", 1.0, 0.25),
-    "warm-50": ("warm start, half left out", 1.0, 0.5),
-    "warm-75": ("warm start, three quarters left out", 1.0, 0.75),
+    "alone": ("each frame alone", 1.0, False),
+    "alone-half": ("each frame alone, half the steps", 0.5, False),
+    "steady": ("averaged with three before and after", 1.0, True),
 }
 #: Title, poses of the capture, knob ``pose`` of every call.
 CAPTURE_ROWS = {

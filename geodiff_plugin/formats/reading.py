@@ -127,8 +127,7 @@ def read_calibration(
 
     Args:
         path: one file, a pair (left, right) for formats with one a view, or the folder of a COLMAP model.
-        cameras: left and right camera of a file of many (KITTI, Kalibr, OAK-D); ``None`` goes by the folder,
-            then by the file.
+        cameras: both cameras of a file of many (KITTI, Kalibr, OAK-D); else by the folder, then by the file.
         image_folder_hint: name or path of the left image's folder (or of the image): ``image_2`` means 2, 3.
         image_names: names or paths of both images, by which a COLMAP model or a transforms.json knows them.
         image_size: ``(width, height)`` of the left image, for files with several resolutions (ZED,

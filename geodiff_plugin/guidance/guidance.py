@@ -20,7 +20,7 @@ from geodiff_plugin.formats import picture_size, read_calibration
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.guidance.evidence import EstimatedRig, EvidenceStore, estimate_rig, make_evidence
 from geodiff_plugin.guidance.inputs import read_inputs, split_views
-from geodiff_plugin.types import MetricDepthOutput, Rig
+from geodiff_plugin.types import Rig
 
 #: The assumption about a rectified pair if only one K is given.
 SAME_CENTRE = (
@@ -59,8 +59,6 @@ class GeometryGuidance:
         measured_baseline: whether the distance between the cameras is measured or calibrated, and not a
             tracker's. Where the poses have to be refined, a measured distance stays as it is; otherwise it is
             weighed against the depth of the scene under the given poses. A rectified rig's is measured.
-        previous: the output of the previous frame, called with ``output_latent=True``. The call then starts
-            in the middle of the schedule, from that latent, and the scale search starts at that scale.
         preset: hyperparameters by name: ``"default"``, ``"fast"``, ``"paper"``, ``"marigold-dc"``,
             ``"search-only"`` or ``"prior-fit"``.
         config: hyperparameters in place of a preset.
@@ -100,7 +98,6 @@ class GeometryGuidance:
         cropped: bool = False,
         unit: str | None = "m",
         measured_baseline: bool = False,
-        previous: MetricDepthOutput | None = None,
         preset: str | None = None,
         config: GuidanceConfig | None = None,
         **knobs: Any,
@@ -114,11 +111,7 @@ class GeometryGuidance:
         if unit not in ("m", None):
             cure = "Give lengths in metres, or None for any other unit."
             bad_value("unit", "'m' or None", repr(unit), cure)
-        if previous is not None and not isinstance(previous, MetricDepthOutput):
-            bad_type("previous", "a MetricDepthOutput, of a guided call of the frame before", previous)
-        if previous is not None and (previous.latent is None or previous.scale is None):
-            bad_value("previous", "an output with its latent", "one without", "Call with output_latent=True.")
-        self.config, self.unit, self.previous = config.changed(**knobs), unit, previous
+        self.config, self.unit = config.changed(**knobs), unit
         check_choice(self.config.rule, "rule", RULES)
         for name in self.config.weights:
             check_choice(name, "a key of weights", TERMS)

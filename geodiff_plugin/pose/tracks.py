@@ -127,8 +127,7 @@ def _linear_inverse_depth(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
 def solve_inverse_depth(tracks: Tracks, Ts: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
     """The inverse depth ``(N,)`` 1/m of every track that fits its right pixels best, by Gauss and Newton.
 
-    ``Ts (V, 4, 4)`` are ``T_right_from_left``, ``weights (V, N)`` of the observations; negative where the
-    rays diverge.
+    ``Ts (V, 4, 4)`` are ``T_right_from_left``, ``weights (V, N)``; the result is negative where rays diverge.
     """
     weights = tracks.seen.astype(float) if weights is None else weights * tracks.seen
     inverse_depth = _linear_inverse_depth(tracks, Ts)

@@ -124,8 +124,7 @@ def load_prior(
             takes the ``depth_map`` of another model.
         device: device of the networks, CPU for ``None``.
         dtype: of the networks.
-        space: what the prior's map is affine in, key of ``SPACES``; ``None`` for that of the folder, and for
-            depth with ``"map"``.
+        space: what the prior's map is affine in, key of ``SPACES``; by default as the folder says, or depth.
         **kwargs: ``variant`` of the weight files (``"fp16"``), and for the download ``revision``, ``token``,
             ``cache_dir``, ``local_files_only``.
 

@@ -71,8 +71,7 @@ class DepthOutput(MarigoldDepthOutput):
 class DepthPrior:
     """Interface of a prior, which has no access to cameras.
 
-    A ``DepthDiffusionPipeline`` is a prior itself; a pipeline of diffusers needs an adapter, such as
-    ``MarigoldPrior``.
+    A ``DepthDiffusionPipeline`` is a prior itself; others need an adapter, such as ``MarigoldPrior``.
 
     Attributes:
         config: of the pipeline; its ``prediction_type`` says what the decoded map is affine in.

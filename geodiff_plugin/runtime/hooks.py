@@ -198,11 +198,11 @@ class GuidedScheduler:
     diffusers keeps the tables that they index: a lookup on another device would wait for it.
 
     ``run`` is a ``GuidedRun``, whose ``guide`` gives the inputs of the stock step and what to add to its
-    ``z_{t-1}``; ``respace`` runs a leading DDIM as trailing; the first ``skipped`` steps are left out.
+    ``z_{t-1}``; ``respace`` runs a leading DDIM as trailing.
     """
 
-    def __init__(self, pipe: Any, run: Any, respace: bool, skipped: int) -> None:
-        self._pipe, self._run, self._respace, self._skipped = pipe, run, respace, skipped
+    def __init__(self, pipe: Any, run: Any, respace: bool) -> None:
+        self._pipe, self._run, self._respace = pipe, run, respace
         original = pipe.scheduler
         is_patched = any(name in vars(original) for name in ("set_timesteps", "step"))
         self._scheduler = original if is_patched else copy.copy(original)
@@ -235,7 +235,7 @@ class GuidedScheduler:
             device = kwargs.get("device")
             stock_set_timesteps(*args, **kwargs | ({} if device is None else {"device": "cpu"}))
             trailing = trailing_timesteps(scheduler, len(scheduler.timesteps)) if self._respace else None
-            self._timesteps = (scheduler.timesteps if trailing is None else trailing).cpu()[self._skipped :]
+            self._timesteps = (scheduler.timesteps if trailing is None else trailing).cpu()
             self._done = 0
             self._run.begin(self._timesteps)
             scheduler.timesteps = self._timesteps.to(device=device)  # which the pipeline's loop iterates over

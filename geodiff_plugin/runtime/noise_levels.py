@@ -94,8 +94,7 @@ def check_scheduler(scheduler: Any) -> None:
 def trailing_timesteps(scheduler: Any, num_inference_steps: int) -> Tensor | None:
     """Timesteps of the same schedule with trailing spacing, for a DDIM that is ``leading``; else ``None``.
 
-    A leading schedule never visits t = 999: it takes pure noise for that of a lower level; with one step it
-    runs at t = 1.
+    A leading schedule never visits t = 999: it takes pure noise for that of a lower level (one step: t = 1).
     """
     if not isinstance(scheduler, DDIMScheduler) or scheduler.config.timestep_spacing != "leading":
         return None

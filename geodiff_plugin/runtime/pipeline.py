@@ -23,7 +23,7 @@ from geodiff_plugin.runtime.estimate import ProcessingGrid, tiny_autoencoder
 from geodiff_plugin.runtime.hooks import Exclusive, networks_of
 from geodiff_plugin.runtime.noise_levels import check_scheduler
 from geodiff_plugin.runtime.output import assemble_output, ensemble_metric
-from geodiff_plugin.runtime.run import GuidedRun, StepCallback, depth_prompt, plan_warm_start
+from geodiff_plugin.runtime.run import GuidedRun, StepCallback, depth_prompt
 
 #: What every stock pipeline's call takes, whatever the prior.
 STOCK_ARGUMENTS = (
@@ -65,8 +65,7 @@ class GuidedCall(_Stock):
             **kwargs: as the stock call takes them.
 
         Returns:
-            ``MetricDepthOutput``, or with ``return_dict=False`` the stock tuple (prediction, uncertainty,
-            latent).
+            ``MetricDepthOutput``, or with ``return_dict=False`` (prediction, uncertainty, latent) as stock.
 
         Raises:
             InputError: ``guidance`` is no ``GeometryGuidance``; a scheduler or offloading that cannot be
@@ -119,13 +118,10 @@ class GuidedCall(_Stock):
             evidence = guidance.prepare(lefts_01)
             if prior.takes_prompt and call.get("prompt_depth") is None:
                 call["prompt_depth"] = depth_prompt(evidence, guidance.config)
-        warm = plan_warm_start(self, prior, guidance, call, grid.size)
-        if warm is not None and warm.latents is not None:
-            call |= {"latents": warm.latents, "generator": None}  # the latents hold the noise already
         # Channels last, as the stock call reads pictures; with given latents Marigold does not accept it.
         layout = torch.channels_last if call["latents"] is None else torch.contiguous_format
         call["image"] = lefts_01.contiguous(memory_format=layout)
-        run = GuidedRun(self, prior, guidance, evidence, call, grid, rounds, callback, tiny, held, warm)
+        run = GuidedRun(self, prior, guidance, evidence, call, grid, rounds, callback, tiny, held)
         try:
             with run:
                 fixed = {"return_dict": True, "output_latent": True, "output_type": "pt"}

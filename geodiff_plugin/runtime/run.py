@@ -1,17 +1,13 @@
-"""``GuidedRun``: state and hooks of one guided call; its start from a previous frame (SDEdit, Meng 2022)."""
+"""``GuidedRun``: state and hooks of one guided call."""
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 import torch.nn.functional as F
-from diffusers import DDIMScheduler
-from diffusers.utils.torch_utils import randn_tensor
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -35,81 +31,12 @@ from geodiff_plugin.runtime.hooks import (
     images_in_float32,
     replaced,
 )
-from geodiff_plugin.runtime.noise_levels import noise_level, trailing_timesteps
-from geodiff_plugin.scale.space import SPACES
+from geodiff_plugin.runtime.noise_levels import noise_level
 
 StepCallback = Callable[[Any, int, Any, dict[str, Tensor | None]], dict[str, Tensor] | None]
 
 #: Longer side of the depth prompt, pixels.
 PROMPT_LONG_EDGE = 256
-
-
-@dataclass(frozen=True)
-class WarmStart:
-    """Where a call starts after a previous frame."""
-
-    near_m: Tensor  # (N * E,) metres, depth of the nearest end of the relative map
-    far_m: Tensor  # (N * E,) metres, of its farthest end
-    skipped: int = 0  # steps of the schedule that are left out
-    latents: Tensor | None = None  # (N * E, C, h, w) start of the first remaining step; ``None`` for noise
-
-
-def plan_warm_start(
-    pipe: Any, prior: DepthPrior, guidance: GeometryGuidance, call: Mapping[str, Any], size: tuple[int, int]
-) -> WarmStart | None:
-    """The start that ``guidance.previous`` gives to a call on a padded grid ``size``; ``None`` without it.
-
-    A DDIM schedule of two steps or more starts from the previous latent; others take over the scale alone.
-    ``InputError`` for an output of other images, members or size, or of a prior of another space.
-    """
-    previous = guidance.previous
-    if previous is None:
-        return None
-    assert previous.latent is not None and previous.scale is not None  # GeometryGuidance has checked that
-    # Not their product alone: three members of one image are no start for three images.
-    given, wanted = tuple(previous.scale.shape), (len(guidance.inputs), call["ensemble_size"])
-    if given != wanted:
-        bad_value("previous", "an output of {} images of {} members".format(*wanted), given)
-    if previous.space not in (None, prior.space):  # ``None`` if the output was made by hand
-        expected = f"the output of a prior whose map is affine in {prior.space}"
-        bad_value("previous", expected, f"one in {previous.space}", "Use one prior for a whole sequence.")
-    device, steps = pipe._execution_device, call["num_inference_steps"]
-    # A metric prior may have rescaled the previous output to metres; this call is in baselines.
-    metres = 1.0 if guidance.unit else previous.rescaled
-    affine = (cast(Tensor, v) for v in (previous.scale, previous.shift, previous.global_scale))
-    ends = SPACES[prior.space].range_of(*(v.flatten().float() for v in affine))
-    near, far = (end.to(device) / metres for end in ends)
-    skipped = min(steps - 1, round(steps * guidance.config.warm_start))
-    if skipped < 1 or not isinstance(pipe.scheduler, DDIMScheduler):
-        return WarmStart(near, far)
-    z0, factor = previous.latent.to(device), pipe.image_processor.config.vae_scale_factor
-    latent_size = tuple(side // factor for side in size)
-    if tuple(z0.shape[-2:]) != latent_size:
-        cure = "A frame of another size begins a sequence of its own."
-        bad_value("previous", f"an output with a latent of {latent_size}", f"{tuple(z0.shape[-2:])}", cure)
-    noise = _noise(z0, prior, call, device)
-    scheduler = copy.deepcopy(pipe.scheduler)
-    scheduler.set_timesteps(steps)
-    trailing = trailing_timesteps(scheduler, steps) if guidance.config.respace else None
-    timesteps = scheduler.timesteps if trailing is None else trailing
-    level = noise_level(scheduler, timesteps[skipped])
-    latents = level.alpha.to(device) * z0.float() + level.sigma.to(device) * noise.to(device).float()
-    return WarmStart(near, far, skipped, latents.to(pipe.dtype))
-
-
-def _noise(z0: Tensor, prior: DepthPrior, call: Mapping[str, Any], device: torch.device) -> Tensor:
-    """Noise for a latent: ``latents`` of the call, or drawn by its generator."""
-    noise = call["latents"]
-    if noise is None:
-        depth = z0[:, prior.depth_channels]
-        noise = randn_tensor(depth.shape, generator=call["generator"], device=device, dtype=z0.dtype)
-        # Further maps that a prior denoises, such as GeoWizard's normals, start from the same noise.
-        return noise.repeat(1, z0.shape[1] // depth.shape[1], 1, 1)
-    if not isinstance(noise, Tensor):
-        bad_type("latents", "None or a torch.Tensor", noise)
-    if noise.shape != z0.shape:
-        bad_value("latents", f"of shape {tuple(z0.shape)}, as those of previous", f"{tuple(noise.shape)}")
-    return noise
 
 
 def depth_prompt(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor | None:
@@ -149,7 +76,6 @@ class GuidedRun:
         callback: StepCallback | None = None,
         tiny: Any | None = None,
         held: Exclusive | None = None,
-        warm: WarmStart | None = None,
     ) -> None:
         self.pipe, self.prior, self.config, self.evidence = pipe, prior, guidance.config, evidence
         self.owners = [i for i in range(len(evidence)) for _ in range(call["ensemble_size"])]
@@ -158,8 +84,7 @@ class GuidedRun:
         self.trajectories: list[Trajectory] = []  # one per chunk
         self.relative: list[Tensor] = []  # decoded maps of the final latents, one per chunk, not padded
         self.members: list[Tensor] = []  # of every image with an ensemble, (E, 1, H, W) metres, not padded
-        self._plan, self._rounds, self._warm = guidance.updates, rounds, warm
-        self._skipped = 0 if warm is None else warm.skipped
+        self._plan, self._rounds = guidance.updates, rounds
         self._callback, self._held = callback, held
         self._reads_latents = call["output_latent"] or callback is not None
         self._codec = MapCodec(pipe, prior, grid, tiny)
@@ -172,7 +97,7 @@ class GuidedRun:
         self._tap = None
         if guidance.through_network and prior.network_input is not None:
             self._tap = DenoiserTap(*prior.network(), prior.network_input)
-        self._scheduler = GuidedScheduler(pipe, self, self.config.respace, self._skipped)
+        self._scheduler = GuidedScheduler(pipe, self, self.config.respace)
 
     def __enter__(self) -> GuidedRun:
         with ExitStack() as stack:
@@ -262,7 +187,6 @@ class GuidedRun:
         """Start the trajectory of the next chunk, with its timesteps on the CPU."""
         first = len(self.trajectories) * self.batch_size
         chunk = slice(first, first + self.batch_size)
-        start = None if self._warm is None else (self._warm.near_m[chunk], self._warm.far_m[chunk])
         plan, prior, metres = self._plan, self.prior, self.prior.own_range
         self.trajectories.append(
             Trajectory(
@@ -272,16 +196,14 @@ class GuidedRun:
                 prior.space,
                 step_latents=plan.step_latents,
                 prior_range=None if metres is None else (metres[chunk, 0], metres[chunk, 1]),
-                start_range=start,
                 valid=None if prior.valid is None else prior.valid[chunk],
             )
         )
         self._results.append(None)
         self._step, self._timesteps, self._shown = 0, timesteps.tolist(), None
         if self.schedule is None:
-            times = {"rounds": self._rounds, "skipped": self._skipped}
-            encodes = self._tap is None
-            self.schedule = make_schedule(self.config, plan, len(timesteps), encodes=encodes, **times)
+            of_call = self.config, plan, len(timesteps)
+            self.schedule = make_schedule(*of_call, rounds=self._rounds, encodes=self._tap is None)
             options = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
             chunks = -(-len(self.owners) // self.batch_size)
             self._bar = tqdm(total=chunks * len(timesteps), **options)

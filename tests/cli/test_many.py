@@ -241,5 +241,13 @@ def test_the_video_of_a_rig(geodiff, fresh, textured_plane, videos):
     assert sorted(os.listdir("out")) == [many.JOURNAL, "000000", "000001", "pairs.csv"]
     report = report_of("out/000001")
     assert report["pair"]["frame"] == 1 and report["inputs"]["right_size"] == [64, 48]
+    alone = [np.load(f"out/{name}/depth.npy") for name in ("000000", "000001")]
+    for _ in range(2):  # again from what the frames gave alone
+        answer = geodiff("depth", *videos, *words, "--steady")
+        assert answer.code == 0 and "2 there already" in answer.out, answer.err
+    for name, depth in zip(("000000", "000001"), alone, strict=True):
+        assert np.array_equal(np.load(f"out/{name}/depth_alone.npy"), depth)
+        steady, confirmed = (np.load(f"out/{name}/{file}.npy") for file in ("depth", "confirmed"))
+        assert confirmed.mean() > 0.5 and 0 < np.abs(np.log(steady / depth)).max() < 0.1
     answer = geodiff("depth", *videos, *words, "--export", "colmap", "--overwrite")
     assert answer.code == 2 and "--export colmap must be left out with a video" in answer.err

@@ -194,12 +194,6 @@ def ensemble_of_two(left, right, K, E, depth) -> GeometryGuidance:
     return GeometryGuidance(right, K, E)
 
 
-@of_small()
-def warm_start(left, right, K, E, depth) -> GeometryGuidance:
-    first = call(bundled_prior(), left, GeometryGuidance(right, K, E), output_latent=True)
-    return GeometryGuidance(right, K, E, previous=first)
-
-
 @case
 def tiny_decoder() -> Result:
     left, right, K, E, _ = small()

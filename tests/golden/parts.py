@@ -432,18 +432,18 @@ def rules() -> dict[str, object]:
 @part
 def schedules() -> dict[str, object]:
     result = {}
-    for steps, corrections, updates_from, rounds, skipped in (
-        (4, 1, 0.0, 1, 0),
-        (10, 3, 0.5, 1, 0),
-        (10, 8, 0.9, 1, 4),
-        (2, 3, 0.4, 3, 0),
-        (5, 2, 0.6, 1, 1),
+    for steps, corrections, updates_from, rounds in (
+        (4, 1, 0.0, 1),
+        (10, 3, 0.5, 1),
+        (10, 8, 0.9, 1),
+        (2, 3, 0.4, 3),
+        (5, 2, 0.6, 1),
     ):
         for start, stop in ((0.0, 1.0), (0.3, 0.7)):
             config = replace(DEFAULT, corrections=corrections, start=start, stop=stop)
             plan = UpdatePlan(2, updates_from, 0.03)
-            made = make_schedule(config, plan, steps, rounds=rounds, skipped=skipped)
-            result[f"{steps}_{corrections}_{updates_from}_{rounds}_{skipped}_{start}"] = str(made)
+            made = make_schedule(config, plan, steps, rounds=rounds)
+            result[f"{steps}_{corrections}_{updates_from}_{rounds}_{start}"] = str(made)
     return result
 
 
