@@ -8,7 +8,8 @@ import torch
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
-from tests.benchmarks import calls, cost, large, many, operations
+from geodiff_plugin.evaluation.datasets import find_pairs, load
+from tests.benchmarks import calls, cost, large, many, maps, operations
 from tests.benchmarks.full_sizes import UNET, VAE
 from tests.benchmarks.matrix import deviation
 from tests.benchmarks.random_marigold import narrowed
@@ -113,3 +114,13 @@ def test_large_scene_is_nearer_at_the_bottom_and_behind_its_panel():
     wall = np.where(panel, np.nan, depth_m)
     assert np.nanmean(wall[-10:]) < np.nanmean(wall[:10])
     assert panel.any() and (depth_m[panel] == large.PANEL_M).all() and np.nanmin(wall) > large.PANEL_M
+
+
+def test_a_better_map_makes_a_better_result():
+    sample = load(find_pairs("synthetic:1@192x144")[0])
+    rows = {title: row for title, *row in maps.measure([sample])}
+    assert len(rows) == 6 and rows["metres, exact"][1] < 0.03
+    assert all(rows["metres, exact"][1] <= error for _, error, _, _ in rows.values())
+    for title, (alone, error, sure, trusted) in rows.items():
+        assert 0.0 < sure <= 1.0 and trusted in (0, 1) and error < 0.2, title
+        assert np.isnan(alone) == title.startswith("none")
