@@ -26,7 +26,7 @@ from geodiff_plugin.capture.results import ALONE, write_agreement, write_results
 from geodiff_plugin.cli.depth import load_guided_prior
 from geodiff_plugin.cli.options import CaptureOptions
 from geodiff_plugin.cli.outputs import single_map, write_maps
-from geodiff_plugin.cli.terminal import collected_warnings, say
+from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, collected_warnings, say
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
 from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, write_text
@@ -209,7 +209,7 @@ def _run_frames(
     capture: Capture, options: CaptureOptions, names: Sequence[str], factor: float | None
 ) -> list[Record]:
     """Depth of every chosen frame that is not done yet, by one process a core; their reports in order."""
-    if options.overwrite:
+    if options.overwrite and this_process().index == 0:  # the journal of all processes
         (options.out / JOURNAL).unlink(missing_ok=True)
     key = _key(capture, options, *OF_POSES, *OF_FRAME)
     items, more = [Item(name, inputs=key) for name in names], list[Any]()
@@ -314,12 +314,12 @@ def _pose_report(capture: Capture) -> Record:
 
 
 def run_capture(options: CaptureOptions) -> None:
-    """Depth of every frame, the answer on stdout, and exit code 1 where a frame failed."""
+    """Depth of every frame, the answer on stdout; ends with ``EXIT_SOME_FAILED`` where a frame failed."""
     with collected_warnings():
         report = capture_report(options)
     print(json.dumps(report, indent=2) if options.json else summary(report, options.out))
     if any("error" in frame for frame in report["frames"]):
-        sys.exit(1)
+        sys.exit(EXIT_SOME_FAILED)
 
 
 def summary(report: Record, out: Path) -> str:

@@ -20,6 +20,7 @@ from geodiff_plugin.capture.capture import choose_neighbours
 from geodiff_plugin.capture.results import fuse, write_map, write_mesh
 from geodiff_plugin.cli import capture as run
 from geodiff_plugin.cli.options import CaptureOptions
+from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.frames import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
@@ -298,6 +299,25 @@ def test_frames_that_are_not_trusted_are_named_and_marked(model, monkeypatch):
     assert "; NOT TRUSTED: f04 -> " in run.summary(report, options.out)
     assert lowest == [0, 1, 0]  # seen by no other frame; of a doubted one that is no excuse
     assert titles == ["f02", "depth", "f04", "depth, not trusted", "f06", "depth"]
+
+
+def test_a_frame_that_fails_is_named_and_the_rest_is_kept(model, tmp_path, monkeypatch, capsys):
+    options, depth = model(), run._depth
+
+    def failing(capture, pipe, name, *args):
+        if name == "f04":
+            raise InputError("f04 is blank.")
+        return depth(capture, pipe, name, *args)
+
+    monkeypatch.setattr(run, "_depth", failing)
+    with pytest.raises(SystemExit) as leaving:
+        run.run_capture(options)
+    assert leaving.value.code == EXIT_SOME_FAILED and "2 of 3 frames" in capsys.readouterr().out
+    report = json.loads((tmp_path / "out/capture.json").read_text())
+    assert "f04 is blank." in report["frames"][1]["error"] and not (tmp_path / "out/f04").exists()
+    monkeypatch.setattr(run, "_depth", depth)
+    run.run_capture(replace(options, overwrite=False))
+    assert (tmp_path / "out/f04/depth.npy").is_file()
 
 
 @pytest.mark.parametrize(
