@@ -63,11 +63,11 @@ def seen_in(frame: DepthFrame, other: DepthFrame) -> Maps:
     return row, column, z, inside
 
 
-def agreed(frame: DepthFrame, others: Sequence[DepthFrame]) -> DepthFrame:
+def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False) -> DepthFrame:
     """A frame, with its depth averaged with that of others where they agree, ``confirmed`` and ``asked``.
 
     A depth that no other frame confirms gives way to one on which several others agree and which together
-    count more. Depth is a mean over inverse depths weighted by confidence.
+    count more, unless things may be ``moving``. Depth is a mean over inverse depths weighted by confidence.
 
     Source: Merrell et al. 2007, S4: depth maps rendered into one view, supported by those that agree.
     """
@@ -85,7 +85,7 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame]) -> DepthFrame:
         missing = missing * np.where(same, 1.0 - RISES * sure, 1.0)
     inverse, confidence = above / total, 1.0 - missing
     alone = confirmed == 0
-    rendered = [_rendered(other, frame) for other in others] if alone.any() else []
+    rendered = [_rendered(other, frame) for other in others] if alone.any() and not moving else []
     for maps in rendered:  # a surface of another frame before ours speaks against ours
         asked += alone & (maps[0] > 0) & (maps[0] < (1 - SAME_SHARE) * frame.depth)
     if len(rendered) >= OUTVOTES:
@@ -202,4 +202,4 @@ def steadied(
 
     for i, (scene, _) in enumerate(poses):
         near = range(max(0, i - STEADY), min(len(poses), i + STEADY + 1))
-        yield agreed(posed(i), [posed(j) for j in near if j != i and poses[j][0] == scene])
+        yield agreed(posed(i), [posed(j) for j in near if j != i and poses[j][0] == scene], moving=True)

@@ -68,5 +68,9 @@ def test_frames_that_agree_are_averaged_within_their_scene(sequence):
     errors = [np.log(frame.depth / true.depth) for frame, true in zip(steady, truth, strict=True)]
     assert frames.flicker(errors, truth)[0] < 0.4 * 0.04
     assert max(np.nanmean(np.abs(error)) for error in errors) < 0.7 * 0.02
+    known[1].depth[40:80, 60:100] *= 0.5  # something that moves: no other frame has it there
+    there = list(steadied([of_camera], known.__getitem__))[1]
+    np.testing.assert_allclose(there.depth[45:75, 65:95], known[1].depth[45:75, 65:95], rtol=1e-6)
+    assert not there.confirmed[45:75, 65:95].any()
     apart = list(steadied([[E] for E in of_camera], known.__getitem__))  # every frame a scene of its own
     assert all(np.allclose(a.depth, k.depth, equal_nan=True) for a, k in zip(apart, known, strict=True))
