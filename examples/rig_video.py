@@ -7,7 +7,7 @@ rig that moves through a scene:
     python -m examples.rig_video left.mp4 right.mp4 calib.txt --frames 50 --out depth.mp4
 
 ``geodiff depth left.mp4 right.mp4`` does the same with several frames in progress and resumes where it was
-interrupted (docs/how-to/sequences.md).
+interrupted, and with ``--steady`` without flicker (docs/how-to/sequences.md).
 """
 
 from __future__ import annotations

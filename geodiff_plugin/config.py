@@ -146,42 +146,36 @@ class GuidanceConfig:
         decoder: decodes and encodes between the steps ([priors](../reference/priors.md#a-tiny-decoder)).
         eta: SSIM against L1 in the photometric term (Eq. 14).
         pyramid_levels: levels of the image pyramid of the photometric term.
-        exposure: photographs are compared in the left one's exposure: gain and bias per channel and a slow
-            field, in closed form.
-        z_test: pixels occluded in a right camera take no part in the photometric term of updates.
+        exposure: photographs are compared in the left one's exposure: gain, bias and a slow field.
+        z_test: pixels that the estimate occludes do not count in the photometric term of updates.
         min_visible: share in view below which the photometric term is off.
         pull_to: what `prior_pull` pulls s_hat, t_hat towards (Eq. 17): the search's result, or 0.
-        points_loss: error at points: Cauchy in inverse depth, in units of 1 % of the points' median, or
-            L1 + L2 in metres (Marigold-DC, Eq. 4).
+        points_loss: error at points: Cauchy in inverse depth, 1 % of the median wide, or L1 + L2 in metres.
         planes: upper bound on the number of planes of the sweep.
         search: joint (near, far) in the cost volume, then the basin that reliable matches prefer (a robust
             fit to the points without a right view); the argmin over g_s (S7.3); or the nearest and the
             farthest point (Marigold-DC).
-        positive: how raw scale and shift become positive (Eq. 13); `square` also clips the relative map to
-            [0, 1] (Marigold-DC, Eq. 2).
+        positive: how raw scale and shift become positive (Eq. 13); `square` also clips the map to [0, 1].
         g_s_range: candidates of the one-number search.
         g_s_candidates: the number of these candidates.
-        reject_reflections: matches that lie behind the prior's first estimate over a region lose their
-            weight: they are reflections in mirrors and glass.
+        reject_reflections: matches behind the prior's first estimate over a region lose their weight.
         correct: the decoded map is fitted to its matches and points and the change is encoded, before the
             updates; with `gradient="denoised"` only (after SteeredMarigold, Gregorek and Nalpantidis 2024).
         corrections: upper bound on the number of steps (or rounds of a one-step prior) that are corrected:
             the last, and the others spread over the second half of the schedule where they fit.
-        even_ensemble: median of an even number: mean of the two middle ones, or the lower (Marigold-DC).
+        even_ensemble: median of an even number of members: the two middle ones' mean, or the lower one.
         crisp: the result is finished at full resolution
             ([dataflow](../explanation/dataflow.md#how-edges-become-crisp)).
         smoothness: weight of the correction's slope against a match of full confidence, on a grid 512 pixels
             long, for a prior that is wrong by 5 %; it falls with the fourth power of that error.
         match_noise: relative error of a perfect match.
-        outlier_width: a match that differs from those of its region by more than this many standard
-            deviations counts for less.
+        outlier_width: from so many standard deviations off those of its region, a match counts for less.
         rule: how a gradient moves the latent, scale and shift: `plain`; `summed`, plain, but the latent
             follows the sum of the loss over its pixels; `adam`; `adam-norm`, Adam on the gradient scaled to
             the noise's norm (Marigold-DC).
         step_latents: step size of `rule` on the latent.
         step_affine: step size of `rule` on raw s_hat, t_hat.
-        inner_steps: updates in each denoising step that makes any: all, or after a correction those of the
-            last quarter of the schedule.
+        inner_steps: updates in each step that makes any: all, or after a correction the last quarter.
         optimize_latents: `False` is Table 4's ablation: scale and shift only (S5.3).
         start: fraction of the schedule before which nothing is updated.
         stop: fraction after which nothing is updated.

@@ -44,8 +44,7 @@ LEAST_ERROR, MOST_ERROR = 0.01, 0.5
 IMAGE_EDGE, DEPTH_EDGE = 0.1, 0.1
 #: Share of the smoothness that remains across any edge.
 LEAST_LINK = 1e-3
-#: How far the window of a match reaches over an edge, as a share of the longer side; step in log depth
-#: that counts as an edge.
+#: Reach of a match over an edge, as a share of the longer side; step in log depth that is an edge.
 EDGE_REACH, EDGE_STEP = 0.006, 0.3
 #: Above this error of the prior, ``EDGE_STEP`` grows with its third power: its edges are in wrong places.
 EDGE_ERROR = 0.11
@@ -148,8 +147,7 @@ def off_edges(target: Matches, depth_m: Tensor, error: Tensor) -> Matches:
     """Matches with less confidence near the depth edges of a map.
 
     A matching window across an edge gives both sides the depth of the nearer surface. Known points have no
-    window and do not belong here. A prior whose ``error`` is above ``EDGE_ERROR`` has its edges in wrong
-    places, so matches lose less.
+    window and do not belong here. Above ``EDGE_ERROR`` a prior errs in its edges: matches lose less.
     """
     size = target.size
     log_depth = _log_depth(depth_m, size)

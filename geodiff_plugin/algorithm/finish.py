@@ -28,8 +28,7 @@ from geodiff_plugin.types import CameraView
 
 #: Samples of a window to each side of its centre.
 HALF = 2
-#: Difference in brightness at which a neighbour's weight falls to a third; a Gaussian over the window, in
-#: samples, does the rest.
+#: Difference in brightness at which a neighbour's weight falls to a third; width of the Gaussian, samples.
 BRIGHTNESS, REACH = 0.1, 1.5
 #: Distance from a ramp to the surfaces beside it, in pixels of the prior's grid.
 BESIDE = 3

@@ -27,8 +27,7 @@ class Trajectory:
 
     ``owners`` is the image of each sample; samples of one image lie side by side. The scale search starts
     from ``prior_range``, a metric prior's metres ``(B,)`` at ``x = 0`` and ``x = 1``. Where
-    ``valid (B, 1, h, w)`` bool is false the prior gives no depth: there its map does not count for the scale,
-    and matches alone decide.
+    ``valid (B, 1, h, w)`` bool is false the prior gives no depth, and matches alone decide.
     """
 
     affine: AffineState  # after the latest update; set by ``settle_scale``

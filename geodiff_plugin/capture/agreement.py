@@ -9,7 +9,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from geodiff_plugin.pose.tracks import match_features, sift_features
+from geodiff_plugin.pose.tracks import LONG_SIDE, match_features, sift_features
 
 #: Two depths of one point agree within this share.
 SAME_SHARE = 0.06
@@ -23,9 +23,12 @@ RISES = 0.4
 OUTVOTES = 2
 #: Frames before and after a frame of a video that it is checked against.
 STEADY = 3
+#: Confidence from which others do not outvote what may have moved.
+SURE = 0.8
 #: The motion of a camera is known if so many matches fit it, to within so many pixels.
 LEAST_INLIERS, INLIER_PX = 20, 1.5
 Maps = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Features = tuple[np.ndarray, np.ndarray]  # points and descriptors of ``sift_features``
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +70,7 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False
     """A frame, with its depth averaged with that of others where they agree, ``confirmed`` and ``asked``.
 
     A depth that no other frame confirms gives way to one on which several others agree and which together
-    count more, unless things may be ``moving``. Depth is a mean over inverse depths weighted by confidence.
+    count more; where things may be ``moving``, only if its confidence is low. Inverse depths are averaged.
 
     Source: Merrell et al. 2007, S4: depth maps rendered into one view, supported by those that agree.
     """
@@ -84,8 +87,8 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False
         above += more / np.where(same, depth, 1.0)
         missing = missing * np.where(same, 1.0 - RISES * sure, 1.0)
     inverse, confidence = above / total, 1.0 - missing
-    alone = confirmed == 0
-    rendered = [_rendered(other, frame) for other in others] if alone.any() and not moving else []
+    alone = (confirmed == 0) & (frame.confidence < (SURE if moving else np.inf))
+    rendered = [_rendered(other, frame) for other in others] if alone.any() else []
     for maps in rendered:  # a surface of another frame before ours speaks against ours
         asked += alone & (maps[0] > 0) & (maps[0] < (1 - SAME_SHARE) * frame.depth)
     if len(rendered) >= OUTVOTES:
@@ -153,13 +156,17 @@ def _vote(rendered: Sequence[tuple[np.ndarray, np.ndarray]], mask: np.ndarray) -
 def scene_poses(frames: Iterable[tuple[DepthFrame, np.ndarray]]) -> list[list[np.ndarray]]:
     """Camera-to-world poses of a video's frames from their matches and depth, a list for every scene.
 
-    Frames, whose poses do not count, come in order, each with its picture ``(H, W, 3)`` in [0, 1]. Where no
-    motion fits, another scene begins. A scene's world is the camera of its first frame.
+    Frames come in order with their pictures ``(H, W, 3)`` in [0, 1]; their ``E`` is ignored. Where no motion
+    fits, another scene begins. A scene's world is the camera of its first frame.
     """
     scenes, before = list[list[np.ndarray]](), None
     for frame, picture in frames:
-        features = sift_features(np.rint(255.0 * picture.mean(-1)).astype(np.uint8))
-        T = None if before is None else _motion(*before, features[0], match_features(before[1], features))
+        grey, scale = np.rint(255.0 * picture.mean(-1)).astype(np.uint8), LONG_SIDE / max(picture.shape)
+        if scale < 1.0:
+            grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        features = sift_features(grey)
+        features[0][:, :2] = (features[0][:, :2] + 0.5) / min(1.0, scale) - 0.5
+        T = None if before is None else _motion(*before, frame.K, features)
         if T is None:
             scenes.append([np.eye(4)])
         else:
@@ -168,20 +175,23 @@ def scene_poses(frames: Iterable[tuple[DepthFrame, np.ndarray]]) -> list[list[np
     return scenes
 
 
-def _motion(
-    frame: DepthFrame, of_frame: tuple[np.ndarray, np.ndarray], following: np.ndarray, pairs: np.ndarray
-) -> np.ndarray | None:
-    """``T (4, 4)`` from a frame's camera to the following one's; ``None`` where too few matches fit one."""
+def _motion(frame: DepthFrame, features: Features, K: np.ndarray, following: Features) -> np.ndarray | None:
+    """``T (4, 4)`` from a frame's camera to the following one's, of intrinsics ``K``, by their features.
+
+    ``None`` where too few matches fit one.
+    """
+    pairs = match_features(features, following)
     if len(pairs) < LEAST_INLIERS:
         return None
-    px, seen = of_frame[0][pairs[:, 0], :2], following[pairs[:, 1], :2]
+    px, seen = features[0][pairs[:, 0], :2], following[0][pairs[:, 1], :2]
     column, row = np.rint(px).astype(int).clip(0, np.array(frame.depth.shape[::-1]) - 1).T
     points = np.c_[px, np.ones(len(px))] @ np.linalg.inv(frame.K).T * frame.depth[row, column, None]
-    fits, turn, shift, inliers = cv2.solvePnPRansac(points, seen, frame.K, None, reprojectionError=INLIER_PX)
+    within = INLIER_PX * max(1.0, max(frame.depth.shape) / LONG_SIDE)
+    fits, turn, shift, inliers = cv2.solvePnPRansac(points, seen, K, None, reprojectionError=within)
     if not fits or len(inliers) < LEAST_INLIERS:
         return None
     at = inliers[:, 0]
-    turn, shift = cv2.solvePnPRefineLM(points[at], seen[at], frame.K, None, turn, shift)
+    turn, shift = cv2.solvePnPRefineLM(points[at], seen[at], K, None, turn, shift)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
     return T
@@ -192,7 +202,7 @@ def steadied(
 ) -> Iterator[DepthFrame]:
     """Every frame of a video in order, agreed with those before and after it in its scene.
 
-    ``scenes`` are of ``scene_poses``, and ``load`` gives a frame by its number, its pose left out.
+    ``scenes`` are of ``scene_poses``; ``load(i)`` returns frame i, whose ``E`` is ignored.
     """
     poses = [(number, E) for number, scene in enumerate(scenes) for E in scene]
 

@@ -72,27 +72,22 @@ def _write_agreed(folder: Path, frame: DepthFrame, unit: str | None) -> None:
             np.save(temporary, getattr(frame, file))
 
 
-def write_steady(frames: Iterable[tuple[Path, np.ndarray, np.ndarray]], unit: str | None) -> int:
-    """Write what finished frames of a video agree on with their neighbours; the number of its scenes.
+def write_steady(
+    known: Sequence[tuple[Path, np.ndarray, str | None]], picture: Callable[[int], np.ndarray]
+) -> list[int]:
+    """Write what finished frames of a video agree on with their neighbours; the scene of each.
 
-    Of each its folder, picture ``(H, W, 3)`` in [0, 1] and ``K (3, 3)``. Its depth by its own run is kept as
-    ``ALONE``, so the same call again changes nothing.
+    Of each its folder, ``K (3, 3)`` and unit; ``picture(i)`` is ``(H, W, 3)`` in [0, 1]. Depth by its own run
+    stays as ``ALONE``, so the same call again changes nothing.
     """
-    known = list[tuple[Path, np.ndarray]]()
-
-    def each() -> Iterable[tuple[DepthFrame, np.ndarray]]:
-        for folder, picture, K in frames:
-            known.append((folder, K))
-            yield _alone(folder, K), picture
-
-    scenes = scene_poses(each())
-    for (folder, _), frame in zip(known, steadied(scenes, lambda i: _alone(*known[i])), strict=True):
+    scenes = scene_poses((_alone(*known[i]), picture(i)) for i in range(len(known)))
+    for (folder, _, unit), frame in zip(known, steadied(scenes, lambda i: _alone(*known[i])), strict=True):
         _write_agreed(folder, frame, unit)
-    return len(scenes)
+    return [number for number, poses in enumerate(scenes) for _ in poses]
 
 
-def _alone(folder: Path, K: np.ndarray) -> DepthFrame:
-    """A frame by its own run, which is kept beside what takes its place."""
+def _alone(folder: Path, K: np.ndarray, _: str | None) -> DepthFrame:
+    """Depth and confidence by the frame's own run, saved as ``ALONE`` on first use."""
     if not (folder / f"{ALONE[1]}.npy").is_file():
         depth, path = np.load(folder / "depth.npy"), folder / "confidence.npy"
         confidence = np.load(path) if path.is_file() else np.full_like(depth, 0.5)

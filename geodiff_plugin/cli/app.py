@@ -59,7 +59,8 @@ def _depth(options: DepthOptions) -> None:
         refs = start_many(options)
         failed = _imported("cli.many.run_many")(options, refs)
     else:
-        options.refuse(["steady"], "given with several pairs in order", "one pair")
+        cure = "Give folders, a list, videos or a bag."
+        options.refuse(["steady"], "given with several pairs in order", "one pair", cure)
         options, watch, failed = _with_folder(options, "geodiff-out"), StopWatch(), False
         with start_pair(options) as folder:
             with watch.stage("start"):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import errno
 import json
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -15,9 +16,9 @@ import numpy as np
 import torch
 from rich.text import Text
 
-from geodiff_plugin._checks import InputError, bad_value, noted
+from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin._threads import WithinCores
-from geodiff_plugin.capture.results import write_steady
+from geodiff_plugin.capture.results import AGREED, ALONE, write_steady
 from geodiff_plugin.cli.depth import Job, load_guided_prior
 from geodiff_plugin.cli.inputs import read_inputs
 from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, start_pair
@@ -25,7 +26,7 @@ from geodiff_plugin.cli.outputs import read_report
 from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, options_of, start_many
 from geodiff_plugin.cli.terminal import collected_warnings, new_table, say, show
 from geodiff_plugin.formats.files import file_digest
-from geodiff_plugin.formats.out import atomic_path, reason_of, write_text
+from geodiff_plugin.formats.out import REPORT, atomic_path, reason_of, write_text
 from geodiff_plugin.formats.reading import has_pose_per_image
 from geodiff_plugin.formats.recordings import (
     BAG_SUFFIXES,
@@ -244,26 +245,40 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
         stages.close()
     answers = [_final(record, there.get(record["key"]), options) for record in records]
     if process.index == 0:
-        if options.steady:
-            _make_steady(options, refs, Stages(options, device), options.out)
         _answer(answers, options, options.out)
+        if options.steady:
+            failed = {row["pair"] for row in answers if row["result"] == "failed"}
+            _make_steady(
+                options, [ref for ref in refs if ref.name not in failed], Stages(options, device), options.out
+            )
     return any(row["result"] == "failed" for row in answers)
 
 
 def _make_steady(options: DepthOptions, refs: Sequence[PairRef], stages: Stages, out: Path) -> None:
-    """Depth of every finished frame, averaged with that of its neighbours where they agree."""
-    reports = [(ref, report) for ref in refs if (report := read_report(out / ref.name))]
+    """Average the depth of every frame with its neighbours' where they agree, and note it in the reports."""
+    folders = [out / ref.name for ref in refs]
+    reports = [read_report(folder) for folder in folders]
 
-    def frames() -> Iterator[tuple[Path, np.ndarray, np.ndarray]]:
-        for ref, report in reports:
-            with noted():  # what is to be warned of was, by the run of the pair
-                left = read_inputs(options_of(ref, options), stages.views(ref)).left
-            yield out / ref.name, left, np.reshape(report["K"], (3, 3))
+    def note(i: int, files: Iterable[str], **entries: Any) -> None:
+        """List the files, which a later run with --overwrite then replaces."""
+        reports[i]["files"]["names"] = sorted({*reports[i]["files"]["names"], *files})
+        write_text(folders[i] / REPORT, json.dumps(reports[i] | entries, indent=2) + "\n")
 
-    count = write_steady(frames(), reports[0][1]["unit"]) if reports else 0
-    stages.close()
-    if count > 1 and not options.quiet:
-        say(f"--steady: depth is averaged within {count} scenes; no motion of the camera leads between them.")
+    def picture(i: int) -> np.ndarray:
+        note(i, [f"{name}.npy" for name in ALONE])
+        return read_inputs(options_of(refs[i], options), stages.views(refs[i])).left
+
+    try:
+        known = [(f, np.reshape(r["K"], (3, 3)), r["unit"]) for f, r in zip(folders, reports, strict=True)]
+        with warnings.catch_warnings(action="ignore"):  # the run of the pair has warned
+            scenes = write_steady(known, picture)
+        for i, scene in enumerate(scenes):
+            note(i, [f"{name}.npy" for name in AGREED], steady={"scene": scene})
+    except OSError as error:
+        raise InputError(f"--steady ended ({reason_of(error)}); the same command resumes.") from error
+    begins = [ref.name for k, ref in enumerate(refs) if k and scenes[k] != scenes[k - 1]]
+    if begins and not options.quiet:
+        say(f"--steady: scenes begin at {', '.join(begins[:9])}; depth is not averaged across them.")
 
 
 def _final(record: Row, there: Row | None, options: DepthOptions) -> Row:

@@ -80,7 +80,7 @@ class DepthOptions(RunOptions):
     topic_right: str | None = declare(None, "Topic of the right images, where LEFT is a bag.", "--right")
     tolerance: float = declare(0.005, "A bag: most seconds between the stamps of a pair.", low=0.0, high=10.0)
     encoding: str = _output("16UC1", "A bag: 16UC1 is whole mm, 32FC1 metres.", choices=("16UC1", "32FC1"))
-    steady: bool = _output(False, "Frames in order: average the depth of neighbours where they agree.")
+    steady: bool = _output(False, "Average each frame with its neighbours where they agree; frames in order.")
     min_confidence: float = _output(0.0, "Least confidence of a point in the cloud, 0 to 1.", low=0, high=1)
     out: Path | None = _output(None, "Folder; geodiff-out, or -2 and so on if taken.", "--out", "-o")
     overwrite: bool = _output(False, "Write into a folder that holds files; do finished pairs anew.")
@@ -174,6 +174,13 @@ class DepthOptions(RunOptions):
             (paper, "view", *default, "Algorithm 1 has two views."),
             (posed, "fov known_length", *together, ""),
             (not posed, "calib cameras e view_e cx_right", "left out with --estimate-pose", "both", known),
+            (
+                not posed,
+                "steady",
+                "left out with --estimate-pose",
+                "both",
+                "Lengths differ from pair to pair.",
+            ),
             (not self.calib, "cameras", *of_file),
             (no_points, "points_scale points_calib", "given with --points", "no --points", ""),
             (not no_points, "disparity", "given in place of --points", "both", ""),

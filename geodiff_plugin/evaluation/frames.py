@@ -82,20 +82,20 @@ def run_sequence(name: str, options: SequenceOptions) -> Page | None:
 
 def _measure_sequence(pipe: Any, render: Any, seed: int, way: str, options: SequenceOptions) -> Record:
     """AbsRel, flicker and seconds a frame of one way of going through a sequence."""
-    sequence, (_, share, steady) = render(seed), WAYS[way]
-    steps = max(1, round((options.steps or 1) * share))
+    sequence = render(seed)
     device, truth = pipe._execution_device, true_frames(sequence)
     clock = time.process_time if device.type == "cpu" else time.perf_counter
     frames, pictures, started = [], [], clock()
     for left, right in zip(sequence.lefts, sequence.rights, strict=True):
         guidance = GeometryGuidance(right.image_01, sequence.K.numpy(), sequence.E.numpy())
         generator = torch.Generator("cpu").manual_seed(options.seed)
-        call = {"num_inference_steps": steps, "generator": generator}
-        out = pipe(left.image_01, guidance=guidance, **call)  # its result is numpy: nothing is pending
+        out = pipe(
+            left.image_01, guidance=guidance, generator=generator, num_inference_steps=options.steps
+        )  # its result is numpy: nothing is pending
         maps = out.prediction[0, ..., 0], out.confidence[0, ..., 0]
         frames.append(DepthFrame("", *maps, sequence.K.numpy().astype(np.float64), np.eye(4)))
         pictures.append(left.image_01.permute(1, 2, 0).numpy())
-    if steady:
+    if way == "steady":
         frames = list(steadied(scene_poses(zip(frames, pictures, strict=True)), frames.__getitem__))
     seconds = clock() - started
     known = [np.isfinite(true.depth) for true in truth]
@@ -108,7 +108,7 @@ def _measure_sequence(pipe: Any, render: Any, seed: int, way: str, options: Sequ
 
 
 _SEQUENCE_COLUMNS: dict[str, CellOf] = {
-    "frames": lambda own: WAYS[own[0]["way"]][0],
+    "frames": lambda own: WAYS[own[0]["way"]],
     "AbsRel": mean_of("abs_rel", 4),
     "worst frame": most_of("worst"),
     "flicker %": mean_of("flicker", 2, 100.0),

@@ -20,11 +20,10 @@ FIGURES = ("gs-sweep", "inner-steps", "ablation", "exposure", "qualitative")
 #: Emulated priors: mean absolute error of log depth, whether the map is blurred, its exponent, 1 for none.
 STRENGTHS = {f"{percent}%": (percent / 100, False, 1.0) for percent in (2, 5, 10, 20)}
 STRENGTHS = {"exact": (0.0, False, 1.0), **STRENGTHS, "blur": (0.01, True, 1.0), "gamma": (0.0, False, 1.6)}
-#: How frames are made: title, share of the steps, whether neighbours are averaged where they agree.
+#: How frames are made.
 WAYS = {
-    "alone": ("each frame alone", 1.0, False),
-    "alone-half": ("each frame alone, half the steps", 0.5, False),
-    "steady": ("averaged with three before and after", 1.0, True),
+    "alone": "each frame alone",
+    "steady": "averaged with three before and after",
 }
 #: Title, poses of the capture, knob ``pose`` of every call.
 CAPTURE_ROWS = {

@@ -9,8 +9,7 @@ from torch import Tensor
 MARGIN_PX = 3
 # Neighbours along a side of the window: every second one of 7.
 _SIDE = 4
-# A difference in brightness of this counts as certain; below it the vote is proportional, so that noise on
-# flat surfaces hardly votes.
+# A difference of this counts as certain; a smaller one in proportion, so that noise hardly votes.
 _CONTRAST = 6.0 / 255.0
 #: A certain vote; the largest for which a cost still fits into a byte.
 VOTE_LEVELS = 7

@@ -20,8 +20,7 @@ PARAMETERS = {
     "speckleRange": 2,
     "disp12MaxDiff": 1,
 }
-#: Shifts below the first number, in pixels, are too small to measure depth; none exceeds the second, as a
-#: share of the image's width.
+#: Shifts below so many pixels are too small to measure depth; none exceeds this share of the image's width.
 MIN_SHIFT_PX, MAX_SHIFT = 0.3, 0.3
 
 

@@ -155,8 +155,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
     ) -> None:
         """Register components and options; to be called last in a subclass's constructor.
 
-        ``image_processor`` resizes and pads; a number pads the sides to multiples of it. ``config`` are
-        further options to be saved.
+        ``image_processor`` resizes and pads, or a number is a multiple to pad to; ``config`` is saved too.
         """
         self.register_modules(**modules)
         self.register_to_config(

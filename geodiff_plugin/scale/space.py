@@ -23,8 +23,7 @@ def smooth_floor(x: Tensor, eps: float = FLOOR_EPS) -> Tensor:
     """Keep relative values ``x``, about [0, 1] but unbounded, above 0 with a gradient that is never zero.
 
     ``(x + sqrt(x^2 + 4 eps^2)) / 2``, whose slope falls only as ``(eps / x)^2`` below 0, so that a clipped
-    pixel can still be pulled back (a softplus would underflow). Not in the paper, which needs ``D(z) >= 0``
-    for Eq. 13.
+    pixel can still be pulled back (a softplus would underflow). Not in the paper; Eq. 13 needs ``D(z) >= 0``.
     """
     root = torch.sqrt(x * x + 4.0 * eps * eps)
     # Below 0 the sum would cancel, and neighbouring values become equal in float32.

@@ -248,6 +248,9 @@ def test_the_video_of_a_rig(geodiff, fresh, textured_plane, videos):
     for name, depth in zip(("000000", "000001"), alone, strict=True):
         assert np.array_equal(np.load(f"out/{name}/depth_alone.npy"), depth)
         steady, confirmed = (np.load(f"out/{name}/{file}.npy") for file in ("depth", "confirmed"))
+        assert report_of(f"out/{name}")["steady"] == {"scene": 0}
         assert confirmed.mean() > 0.5 and 0 < np.abs(np.log(steady / depth)).max() < 0.1
+    answer = geodiff("depth", *videos, *words, "--overwrite")  # nothing of --steady is left
+    assert answer.code == 0 and not list(Path("out").glob("*/*_alone.npy")), answer.err
     answer = geodiff("depth", *videos, *words, "--export", "colmap", "--overwrite")
     assert answer.code == 2 and "--export colmap must be left out with a video" in answer.err

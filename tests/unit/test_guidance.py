@@ -112,7 +112,6 @@ def test_points_of_either_form():
         ({"search": "one-number", "weights": {"matches": 1.0}}, ValueError, "photometric weight"),
         ({"search": "points-range"}, ValueError, "'points-range' needs points"),
         ({"right": None, "E": None, "points": POINTS, "weights": {"matches": 1}}, ValueError, "weights must"),
-        ({"previous": 3}, TypeError, "previous must be a MetricDepthOutput"),
     ],
 )
 def test_bad_input_names_the_argument(changes, error, message):
