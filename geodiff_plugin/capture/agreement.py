@@ -8,8 +8,9 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+import torch
 
-from geodiff_plugin.pose.tracks import LONG_SIDE, match_features, sift_features
+from geodiff_plugin.pose.tracks import LONG_SIDE, grey_image, match_features, sift_features
 
 #: Two depths of one point agree within this share.
 SAME_SHARE = 0.06
@@ -25,10 +26,11 @@ OUTVOTES = 2
 STEADY = 3
 #: Confidence from which others do not outvote what may have moved.
 SURE = 0.8
-#: The motion of a camera is known if so many matches fit it, to within so many pixels.
+#: The motion of a camera is known if so many matches fit it, to within so many pixels of the shrunk pictures.
 LEAST_INLIERS, INLIER_PX = 20, 1.5
 Maps = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-Features = tuple[np.ndarray, np.ndarray]  # points and descriptors of ``sift_features``
+#: Of a picture: what ``sift_features`` returns, K, and depth on its grid.
+Seen = tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,37 +163,33 @@ def scene_poses(frames: Iterable[tuple[DepthFrame, np.ndarray]]) -> list[list[np
     """
     scenes, before = list[list[np.ndarray]](), None
     for frame, picture in frames:
-        grey, scale = np.rint(255.0 * picture.mean(-1)).astype(np.uint8), LONG_SIDE / max(picture.shape)
-        if scale < 1.0:
-            grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        features = sift_features(grey)
-        features[0][:, :2] = (features[0][:, :2] + 0.5) / min(1.0, scale) - 0.5
-        T = None if before is None else _motion(*before, frame.K, features)
+        image, factor = torch.from_numpy(picture).permute(2, 0, 1), LONG_SIDE / max(picture.shape)
+        grey, K = grey_image(image, torch.from_numpy(frame.K), min(1.0, factor))
+        depth = cv2.resize(frame.depth, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        seen = sift_features(grey), K, depth
+        T = None if before is None else _motion(before, seen)
         if T is None:
             scenes.append([np.eye(4)])
         else:
             scenes[-1].append(scenes[-1][-1] @ np.linalg.inv(T))
-        before = frame, features
+        before = seen
     return scenes
 
 
-def _motion(frame: DepthFrame, features: Features, K: np.ndarray, following: Features) -> np.ndarray | None:
-    """``T (4, 4)`` from a frame's camera to the following one's, of intrinsics ``K``, by their features.
-
-    ``None`` where too few matches fit one.
-    """
+def _motion(before: Seen, after: Seen) -> np.ndarray | None:
+    """``T (4, 4)`` from the camera before to the one after; ``None`` where too few matches fit one."""
+    (features, K, depth), (following, K_after, _) = before, after
     pairs = match_features(features, following)
     if len(pairs) < LEAST_INLIERS:
         return None
     px, seen = features[0][pairs[:, 0], :2], following[0][pairs[:, 1], :2]
-    column, row = np.rint(px).astype(int).clip(0, np.array(frame.depth.shape[::-1]) - 1).T
-    points = np.c_[px, np.ones(len(px))] @ np.linalg.inv(frame.K).T * frame.depth[row, column, None]
-    within = INLIER_PX * max(1.0, max(frame.depth.shape) / LONG_SIDE)
-    fits, turn, shift, inliers = cv2.solvePnPRansac(points, seen, K, None, reprojectionError=within)
+    column, row = np.rint(px).astype(int).clip(0, np.array(depth.shape[::-1]) - 1).T
+    points = np.c_[px, np.ones(len(px))] @ np.linalg.inv(K).T * depth[row, column, None]
+    fits, turn, shift, inliers = cv2.solvePnPRansac(points, seen, K_after, None, reprojectionError=INLIER_PX)
     if not fits or len(inliers) < LEAST_INLIERS:
         return None
     at = inliers[:, 0]
-    turn, shift = cv2.solvePnPRefineLM(points[at], seen[at], K, None, turn, shift)
+    turn, shift = cv2.solvePnPRefineLM(points[at], seen[at], K_after, None, turn, shift)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
     return T

@@ -86,14 +86,19 @@ def write_steady(
     return [number for number, poses in enumerate(scenes) for _ in poses]
 
 
+def save_alone(folder: Path, depth: np.ndarray, confidence: np.ndarray | None) -> None:
+    """Save depth and confidence of a frame's own run as ``ALONE``; without a confidence 0.5 everywhere."""
+    confidence = np.full_like(depth, 0.5) if confidence is None else confidence
+    for file, values in zip(ALONE, (depth, confidence), strict=True):
+        with atomic_path(folder / f"{file}.npy") as temporary:
+            np.save(temporary, values.astype(np.float32))
+
+
 def _alone(folder: Path, K: np.ndarray, _: str | None) -> DepthFrame:
     """Depth and confidence by the frame's own run, saved as ``ALONE`` on first use."""
     if not (folder / f"{ALONE[1]}.npy").is_file():
-        depth, path = np.load(folder / "depth.npy"), folder / "confidence.npy"
-        confidence = np.load(path) if path.is_file() else np.full_like(depth, 0.5)
-        for alone, values in zip(ALONE, (depth, confidence), strict=True):
-            with atomic_path(folder / f"{alone}.npy") as temporary:
-                np.save(temporary, values)
+        path = folder / "confidence.npy"
+        save_alone(folder, np.load(folder / "depth.npy"), np.load(path) if path.is_file() else None)
     depth, confidence = (np.load(folder / f"{alone}.npy") for alone in ALONE)
     return DepthFrame(folder.name, depth, confidence, K, np.eye(4))
 

@@ -22,7 +22,7 @@ from geodiff_plugin import __version__
 from geodiff_plugin._checks import InputError, bad_value, check_positive
 from geodiff_plugin._threads import WithinCores, available_cores
 from geodiff_plugin.capture.capture import Capture
-from geodiff_plugin.capture.results import ALONE, write_agreement, write_results
+from geodiff_plugin.capture.results import ALONE, save_alone, write_agreement, write_results
 from geodiff_plugin.cli.depth import load_guided_prior
 from geodiff_plugin.cli.options import CaptureOptions
 from geodiff_plugin.cli.outputs import single_map, write_maps
@@ -170,9 +170,7 @@ def _write_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[],
     """One frame: its files, and its report."""
     name, pipe, started = item.key, loaded(), time.perf_counter()
     output = _depth(capture, pipe, name, options, options.points)
-    depth, sure = single_map(output.prediction), output.confidence
-    confidence = np.full_like(depth, 0.5) if sure is None else single_map(sure)
-    solved, number = capture.solve(), capture.names.index(name)
+    depth, solved, number = single_map(output.prediction), capture.solve(), capture.names.index(name)
     low, middle, high = (float(v) for v in np.percentile(depth, (2, 50, 98)))
     report = {
         "version": __version__,
@@ -191,8 +189,7 @@ def _write_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[],
 
     def fill(folder: Path) -> None:
         report["files"] = write_maps(folder, output, capture.image(name))
-        for file, values in zip(ALONE, (depth, confidence), strict=True):
-            np.save(folder / f"{file}.npy", values.astype(np.float32))
+        save_alone(folder, depth, None if output.confidence is None else single_map(output.confidence))
         report["seconds"] = round(time.perf_counter() - started, 2)
         write_text(folder / REPORT, json.dumps(report, indent=2) + "\n")
 

@@ -7,7 +7,7 @@ import errno
 import json
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -248,15 +248,15 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> bool:
         _answer(answers, options, options.out)
         if options.steady:
             failed = {row["pair"] for row in answers if row["result"] == "failed"}
-            _make_steady(
-                options, [ref for ref in refs if ref.name not in failed], Stages(options, device), options.out
-            )
+            with closing(Stages(options, device)) as stages:
+                _make_steady(options, [ref for ref in refs if ref.name not in failed], stages)
     return any(row["result"] == "failed" for row in answers)
 
 
-def _make_steady(options: DepthOptions, refs: Sequence[PairRef], stages: Stages, out: Path) -> None:
+def _make_steady(options: DepthOptions, refs: Sequence[PairRef], stages: Stages) -> None:
     """Average the depth of every frame with its neighbours' where they agree, and note it in the reports."""
-    folders = [out / ref.name for ref in refs]
+    assert options.out is not None
+    folders = [options.out / ref.name for ref in refs]
     reports = [read_report(folder) for folder in folders]
 
     def note(i: int, files: Iterable[str], **entries: Any) -> None:

@@ -89,9 +89,8 @@ def _measure_sequence(pipe: Any, render: Any, seed: int, way: str, options: Sequ
     for left, right in zip(sequence.lefts, sequence.rights, strict=True):
         guidance = GeometryGuidance(right.image_01, sequence.K.numpy(), sequence.E.numpy())
         generator = torch.Generator("cpu").manual_seed(options.seed)
-        out = pipe(
-            left.image_01, guidance=guidance, generator=generator, num_inference_steps=options.steps
-        )  # its result is numpy: nothing is pending
+        call = {"generator": generator, "num_inference_steps": options.steps}
+        out = pipe(left.image_01, guidance=guidance, **call)  # its result is numpy: nothing is pending
         maps = out.prediction[0, ..., 0], out.confidence[0, ..., 0]
         frames.append(DepthFrame("", *maps, sequence.K.numpy().astype(np.float64), np.eye(4)))
         pictures.append(left.image_01.permute(1, 2, 0).numpy())

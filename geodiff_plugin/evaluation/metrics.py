@@ -167,7 +167,7 @@ STEP_PX, REACH_PX = 3.0, 4
 RATIOS = np.linspace(1.05, 1.25, 10)
 #: iBims-1's Canny filter of depth scaled to [0, 1], and its longest distance between two boundaries, pixels.
 CANNY_SIGMA, CANNY_LOW, CANNY_HIGH, FARTHEST_PX = np.sqrt(2.0), 0.1, 0.2, 10.0
-#: Step of log depth that makes an edge of dense truth; how near it counts, how far off surfaces are, pixels.
+#: Step of log depth that makes an edge of dense truth; how near it counts, how far off surfaces begin, px.
 LOG_STEP, NEAR_EDGE, OFF_EDGE = 0.08, 3, 5
 
 

@@ -20,7 +20,7 @@ FIGURES = ("gs-sweep", "inner-steps", "ablation", "exposure", "qualitative")
 #: Emulated priors: mean absolute error of log depth, whether the map is blurred, its exponent, 1 for none.
 STRENGTHS = {f"{percent}%": (percent / 100, False, 1.0) for percent in (2, 5, 10, 20)}
 STRENGTHS = {"exact": (0.0, False, 1.0), **STRENGTHS, "blur": (0.01, True, 1.0), "gamma": (0.0, False, 1.6)}
-#: How frames are made.
+#: How depth of a sequence is made, by the title of its row.
 WAYS = {
     "alone": "each frame alone",
     "steady": "averaged with three before and after",

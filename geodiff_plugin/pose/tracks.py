@@ -210,7 +210,7 @@ class GreyViews:
     K_rights: np.ndarray  # (V, 3, 3)
 
 
-def _grey(image_01: Tensor, K_image: Tensor, factor: float) -> tuple[np.ndarray, np.ndarray]:
+def grey_image(image_01: Tensor, K_image: Tensor, factor: float) -> tuple[np.ndarray, np.ndarray]:
     """A grey image shrunk by a factor <= 1, and its K."""
     pixels = image_01.detach().cpu().float().permute(1, 2, 0).contiguous().numpy()
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if pixels.shape[-1] == 3 else pixels[..., 0]
@@ -227,11 +227,11 @@ def _grey(image_01: Tensor, K_image: Tensor, factor: float) -> tuple[np.ndarray,
 
 def grey_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> GreyViews:
     """The images on the grid of the matches; ``left_01 (3, H, W)`` in [0, 1] has ``K_left (3, 3)``."""
-    left, K = _grey(left_01, K_left, min(1.0, LONG_SIDE / max(left_01.shape[-2:])))
+    left, K = grey_image(left_01, K_left, min(1.0, LONG_SIDE / max(left_01.shape[-2:])))
     small = []
     for image, K_right, _ in rights:
         as_fine = float(K[0, 0] / K_right[0, 0])
-        small.append(_grey(image, K_right, min(1.0, as_fine, 2 * LONG_SIDE / max(image.shape[-2:]))))
+        small.append(grey_image(image, K_right, min(1.0, as_fine, 2 * LONG_SIDE / max(image.shape[-2:]))))
     return GreyViews(left, tuple(grey for grey, _ in small), K, np.stack([K_right for _, K_right in small]))
 
 
