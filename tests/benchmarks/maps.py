@@ -81,9 +81,9 @@ def _error_of_map(sample: StereoSample, kind: Kind, depth_map: np.ndarray) -> fl
 def measure(samples: Sequence[StereoSample]) -> list[tuple[str, float, float, float, int]]:
     """Title, AbsRel of the map and of the guided result, median confidence and trusted results, by kind."""
     rows = []
-    bundled = enable_geometry_guidance(load_bundled_prior())
     for kind in (None, *KINDS):
-        pipe = bundled if kind is None else enable_geometry_guidance(load_prior("map", space=kind.space))
+        prior = load_bundled_prior() if kind is None else load_prior("map", space=kind.space)
+        pipe = enable_geometry_guidance(prior)
         pipe.set_progress_bar_config(disable=True)
         alone, errors, confidence, trusted = [], [], [], 0
         for sample in samples:
@@ -117,6 +117,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    import tests.scenes.dataset  # noqa: F401  registers synthetic:N
-
     main()
