@@ -142,15 +142,15 @@ class GuidanceConfig:
         depth_range: bounds of the sweep and of the nearest and farthest depth of the search.
         pose: poses that do not fit the matches are refined ([poses](../how-to/poses.md#given-poses)).
         clean_photographs: JPEG blocks and strong sensor noise are removed before photographs are compared;
-            the prior sees the image as it is, but for `--distortion`, which undistorts cleaned ones.
-        decoder: decodes and encodes between the steps ([priors](../reference/priors.md#a-tiny-decoder)).
+            the prior sees the image as it is, except that `--distortion` undistorts cleaned ones.
+        decoder: what decodes and encodes latents ([priors](../reference/priors.md#a-tiny-decoder)).
         eta: SSIM against L1 in the photometric term (Eq. 14).
         pyramid_levels: levels of the image pyramid of the photometric term.
         exposure: photographs are compared in the left one's exposure: gain, bias and a slow field.
-        z_test: pixels that the estimate occludes do not count in the photometric term of updates.
+        z_test: pixels that the estimate occludes in a right view do not count in the photometric term.
         min_visible: share in view below which the photometric term is off.
         pull_to: what `prior_pull` pulls s_hat, t_hat towards (Eq. 17): the search's result, or 0.
-        points_loss: error at points: Cauchy in inverse depth, 1 % of the median wide, or L1 + L2 in metres.
+        points_loss: at points: Cauchy in inverse depth over 1 % of the points' median, or L1 + L2 in metres.
         planes: upper bound on the number of planes of the sweep.
         search: joint (near, far) in the cost volume, then the basin that reliable matches prefer (a robust
             fit to the points without a right view); the argmin over g_s (S7.3); or the nearest and the
@@ -158,24 +158,24 @@ class GuidanceConfig:
         positive: how raw scale and shift become positive (Eq. 13); `square` also clips the map to [0, 1].
         g_s_range: candidates of the one-number search.
         g_s_candidates: the number of these candidates.
-        reject_reflections: matches behind the prior's first estimate over a region lose their weight.
+        reject_reflections: regions of matches behind the prior's first estimate count as reflections.
         correct: the decoded map is fitted to its matches and points and the change is encoded, before the
             updates; with `gradient="denoised"` only (after SteeredMarigold, Gregorek and Nalpantidis 2024).
         corrections: upper bound on the number of steps (or rounds of a one-step prior) that are corrected:
             the last, and the others spread over the second half of the schedule where they fit.
-        even_ensemble: median of an even number of members: the two middle ones' mean, or the lower one.
+        even_ensemble: median of an even number of members: mean of the middle two, or the lower of them.
         crisp: the result is finished at full resolution
             ([dataflow](../explanation/dataflow.md#how-edges-become-crisp)).
         smoothness: weight of the correction's slope against a match of full confidence, on a grid 512 pixels
             long, for a prior that is wrong by 5 %; it falls with the fourth power of that error.
         match_noise: relative error of a perfect match.
-        outlier_width: from so many standard deviations off those of its region, a match counts for less.
+        outlier_width: standard deviations from its region beyond which a match counts for less.
         rule: how a gradient moves the latent, scale and shift: `plain`; `summed`, plain, but the latent
             follows the sum of the loss over its pixels; `adam`; `adam-norm`, Adam on the gradient scaled to
             the noise's norm (Marigold-DC).
         step_latents: step size of `rule` on the latent.
         step_affine: step size of `rule` on raw s_hat, t_hat.
-        inner_steps: updates in each step that makes any: all, or after a correction the last quarter.
+        inner_steps: updates in a denoising step; after a correction only the last quarter of steps makes any.
         optimize_latents: `False` is Table 4's ablation: scale and shift only (S5.3).
         start: fraction of the schedule before which nothing is updated.
         stop: fraction after which nothing is updated.

@@ -206,7 +206,7 @@ class Runner:
         self._progress = progress and self.process.index == 0
         self._begun = set[Item]()
         low, high = (len(items) * (self.process.index + i) // self.process.count for i in (0, 1))
-        # Of another's share from the end on: an item may start from the result of the one before.
+        # Of another's share from the end on, where its process arrives last.
         self._left = deque(self.items[low:high] + self.items[:low][::-1] + self.items[high:][::-1])
         self._struck: dict[str, list[str]] = {}  # labels of the items that failed, by the cause
         self._unsaid: list[str] = []  # the first failure, as long as every item fails as the first one did

@@ -80,7 +80,7 @@ class PoseReport:
 class CameraView(NamedTuple):
     """A right image ``(C, H, W)`` float32 in [0, 1], C = 3, or 1 for grey, and its camera.
 
-    ``K (3, 3)`` is in pixels of this image; ``T_right_from_left (4, 4)``, metres, maps points to its frame.
+    ``K (3, 3)`` is in pixels of this image; ``T_right_from_left (4, 4)``, metres, maps left points to it.
     """
 
     image_01: torch.Tensor

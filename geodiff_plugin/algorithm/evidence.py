@@ -1,6 +1,6 @@
 """``Evidence``: cost volume, matches and points of a left image, made once a call; views of a chunk.
 
-Matches, corrections and losses lie on one grid of at most ``sweep_pixels``, the result on the image's.
+Matches, corrections and losses lie on one grid of at most ``sweep_pixels``; the result has the image's size.
 Source: S7.3 (the plane-sweep view of the g_s search); the matches are beyond it.
 """
 

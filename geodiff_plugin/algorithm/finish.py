@@ -28,7 +28,7 @@ from geodiff_plugin.types import CameraView
 
 #: Samples of a window to each side of its centre.
 HALF = 2
-#: Difference in brightness at which a neighbour's weight falls to a third; width of the Gaussian, samples.
+#: Difference in brightness at which a neighbour's weight falls to a third; deviation of a Gaussian, samples.
 BRIGHTNESS, REACH = 0.1, 1.5
 #: Distance from a ramp to the surfaces beside it, in pixels of the prior's grid.
 BESIDE = 3
@@ -218,7 +218,8 @@ def _crispness(depth_m: Tensor) -> Tensor:
     step = torch.maximum(F.pad(across, (1, 0)), F.pad(down, (0, 0, 1, 0)))
     ends, further = [highest(side, NEARBY) for side in (log_depth, -log_depth)], WIDE - NEARBY
     near = ends[0] + ends[1]
-    wide = sum(F.max_pool2d(F.pad(end, (further,) * 4), 3, 1, dilation=further) for end in ends)  # of 9
+    # The largest of nine neighbouring windows is that of a window three times as wide.
+    wide = sum(F.max_pool2d(F.pad(end, (further,) * 4), 3, 1, dilation=further) for end in ends)
     at_edge = (near > EDGE) & (wide < RISE * near)
     share = torch.where(at_edge, highest(step, NEARBY) / near, torch.nan)[..., WIDE:-WIDE, WIDE:-WIDE]
     return (share.flatten().nanmedian().nan_to_num(1.0) / CRISP).clamp(LEAST_CRISP, 1.0)

@@ -18,10 +18,7 @@ class Round(NamedTuple):
 
 @dataclass(frozen=True)
 class Schedule:
-    """The rounds of every denoising step of a guided call that runs; an empty entry leaves a step unchanged.
-
-    With ``moves``, rounds move latents.
-    """
+    """Rounds of every denoising step of a guided call (empty: left alone); whether they move latents."""
 
     steps: tuple[tuple[Round, ...], ...]
     moves: bool = True

@@ -43,7 +43,7 @@ from geodiff_plugin.cli.outputs import depth_summary
 
 #: A visitor's uploads, result and files are deleted after this long, and when the tab is closed.
 FORGET_AFTER_S = 600
-#: Least confidence of points; angles of view around the cloud and from above; distance, of its depth.
+#: Least confidence of points; view of the cloud: degrees around, from above, distance over its depth.
 LEAST_CONFIDENCE, VIEW_ANGLES, VIEW_FROM = 0.5, (90, 75), 1.05
 CLOUD_TAB, FILES_TAB, PANEL_HEIGHT, NIGHT = "Point cloud", "Downloads", 560, (0.09, 0.1, 0.12, 1.0)
 THEME = gr.themes.Base(

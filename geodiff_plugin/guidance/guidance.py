@@ -44,7 +44,7 @@ class GeometryGuidance:
     Args:
         right: the right image (PIL, numpy HWC uint8/uint16/float in [0, 1], torch CHW), of any size; a tuple
             of images for several further views; ``None`` with ``points`` alone.
-        K: ``(3, 3)`` intrinsics, pixels; one matrix for all views, or a tuple ``(K_left, K_right, ...)``.
+        K: ``(3, 3)`` in each image's pixels: one matrix for all views, or a tuple ``(K_left, K_right, ...)``.
         E: ``(4, 4)`` pose of the right camera in the left camera's frame, metres; or a tuple ``(E_left,
             E_right, ...)`` of camera-to-world poses; ``None`` without a right view.
         points: known depths, metres: a sparse map ``(H, W)`` of the left image's size (0, NaN and infinity
@@ -163,7 +163,7 @@ class GeometryGuidance:
             **arguments: further arguments of the constructor.
 
         Raises:
-            InputError: also for images of another size than the calibration's; the left one's at the call.
+            InputError: also for images of another size than the calibration's; the call checks the left one.
         """
         size = arguments.get("left_size")
         with noted() as warned:

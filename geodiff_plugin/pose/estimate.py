@@ -223,7 +223,7 @@ def _rotation_residuals(tracks: Tracks) -> np.ndarray:
 def polished(views: GreyViews, Ts: np.ndarray, depth_m: Tensor, sparse: Tracks) -> tuple[np.ndarray, Tracks]:
     """Estimated poses ``(V, 4, 4)`` of the ``sparse`` inliers, fitted once more to all matches of all views.
 
-    ``depth_m`` is as for ``dense_tracks``. Returns poses, with the first baseline as it was, and matches.
+    ``depth_m`` is as for ``dense_tracks``. Returns poses, the first baseline unchanged, and all matches.
     """
     Ts = Ts.astype(np.float32).astype(np.float64)  # the precision that the depth was made with
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, Ts)])

@@ -113,7 +113,8 @@ def _likeliest(tracks: Tracks, T: np.ndarray) -> tuple[str, _Fit, bool]:
 def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
     """A sentence on the mistake that would make the matches of one right view fit, or ``None``.
 
-    ``T (4, 4)`` is ``T_right_from_left`` as given, ``near`` the pose near it that fits best.
+    ``T (4, 4)`` is ``T_right_from_left`` as given, ``near`` the pose near it that fits best: where only
+    that fits, the pose is inexact.
     """
     given, nearby = _fit(tracks, T)[0], _fit(tracks, near)
     sentence, (shares, median_px), far = _likeliest(tracks, T)

@@ -77,7 +77,8 @@ def refine_views(
 
     Lengths in metres (``unit``) are questioned if they look like millimetres. ``measured`` baselines keep
     their lengths, as those of a rectified rig do; others are weighed against the depth of the scene. The
-    given views are returned if they fit, without enough matches or a better pose, and with a mistake.
+    given views are returned if they fit, if there are too few matches, if a mistake explains the misfit,
+    or if no better pose is near.
     """
     views, given = grey_views(left_01, rights, K_left), _poses(rights)
     sparse = sparse_tracks(views)

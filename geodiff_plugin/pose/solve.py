@@ -254,7 +254,7 @@ def depth_spread(tracks: Tracks, Ts: np.ndarray) -> float:
     ahead = at.inverse_depth > 0
     if not ahead.any():
         return float("inf")
-    # Steps with translations in baselines, without the one that scales them all, which changes only the unit.
+    # Steps with translations in baselines, without the one that only changes the unit.
     unit = np.tile(np.repeat([1.0, np.linalg.norm(Ts[0, :3, 3])], 3), len(Ts))
     longer = np.concatenate([np.r_[np.zeros(3), T[:3, 3]] for T in Ts]) / unit
     free = unit[:, None] * np.linalg.svd(longer[None])[2][1:].T

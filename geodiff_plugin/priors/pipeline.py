@@ -155,7 +155,7 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
     ) -> None:
         """Register components and options; to be called last in a subclass's constructor.
 
-        ``image_processor`` resizes and pads, or a number is a multiple to pad to; ``config`` is saved too.
+        ``image_processor`` resizes and pads; a number pads sides to its multiples. ``config`` is saved too.
         """
         self.register_modules(**modules)
         self.register_to_config(

@@ -21,15 +21,16 @@ MATCH_NOISE_PX = 0.25
 RIGHT_WITHIN = 0.1
 #: Log-odds, by logistic regression on pairs with truth, every pair weighing the same
 #: (``python -m tests.benchmarks.confidence`` refits them): constant, certainty, strength of the prior,
-#: photometric agreement, and relative spread of the ensemble (by hand: 10 % halve the odds twice).
+#: photometric agreement, and relative spread of the ensemble (by hand: 10 % quarter the odds).
 BY_EVIDENCE = (-0.228, 0.788, 2.42, 0.0864, -15.0)
-# Bounds of the photometric error, of the prior's error, and of the error that remains in a depth.
+# Bounds beyond which the photometric error, the prior's, and the error left in a depth make no difference.
 _LEAST_DIFFERENCE, _MOST_DIFFERENCE = 0.01, 0.1
 _STRONG, _WEAK = 0.03, 0.15
 _LEAST_LEFT, _MOST_LEFT = 0.0005, 0.05
 # Errors in log depth: the least that matches can measure, and that of a useless prior.
 _BEST, _USELESS = 0.01, 0.5
-# Support at which the prior's error is half known: it is measured where there are matches.
+# Support at which the prior's error is half known: it is measured where there are matches, and a prior that
+# is right on the street may be wrong on the trees above it.
 _HALF_KNOWN = 0.1
 
 

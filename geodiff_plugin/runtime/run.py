@@ -202,8 +202,8 @@ class GuidedRun:
         self._results.append(None)
         self._step, self._timesteps, self._shown = 0, timesteps.tolist(), None
         if self.schedule is None:
-            of_call = self.config, plan, len(timesteps)
-            self.schedule = make_schedule(*of_call, rounds=self._rounds, encodes=self._tap is None)
+            encodes, count = self._tap is None, len(timesteps)
+            self.schedule = make_schedule(self.config, plan, count, rounds=self._rounds, encodes=encodes)
             options = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
             chunks = -(-len(self.owners) // self.batch_size)
             self._bar = tqdm(total=chunks * len(timesteps), **options)
