@@ -71,26 +71,26 @@ def solve_field(system: FieldSystem, steps: int, start: Tensor | None = None) ->
 def _conjugate_gradients(system: FieldSystem, x: Tensor, steps: int) -> Tensor:
     """``x`` after ``steps`` steps, with the diagonal as the preconditioner.
 
-    The system is scaled to a diagonal of 1, and vectors change in place: most of the time goes to memory.
+    The system is scaled to a diagonal of 1. Vectors are flat and change in place, which saves memory traffic.
     """
     tiny = 1e-20  # a channel that has converged stays where it is
     root = system.diagonal().rsqrt()
-    across = system.across * root[..., 1:] * root[..., :-1]
+    across = F.pad(system.across * root[..., 1:] * root[..., :-1], (0, 1))  # no link from row to row
     down = system.down * root[..., 1:, :] * root[..., :-1, :]
+    links = (across.flatten(2)[..., :-1], 1), (down.flatten(2), system.weight.shape[-1])
 
     def apply(u: Tensor) -> Tensor:
         out = u.clone()
-        out[..., 1:].addcmul_(across, u[..., :-1], value=-1.0)
-        out[..., :-1].addcmul_(across, u[..., 1:], value=-1.0)
-        out[..., 1:, :].addcmul_(down, u[..., :-1, :], value=-1.0)
-        out[..., :-1, :].addcmul_(down, u[..., 1:, :], value=-1.0)
+        for link, away in links:
+            out[..., away:].addcmul_(link, u[..., :-away], value=-1.0)
+            out[..., :-away].addcmul_(link, u[..., away:], value=-1.0)
         return out
 
     def dot(a: Tensor, b: Tensor) -> Tensor:
-        return (a * b).sum((-2, -1), keepdim=True)
+        return torch.linalg.vecdot(a, b)[..., None]
 
-    x = x / root
-    residual = system.pull * root - apply(x)
+    x = (x / root).flatten(2)
+    residual = (system.pull * root).flatten(2) - apply(x)
     direction, along = residual.clone(), dot(residual, residual)
     for _ in range(steps):
         image = apply(direction)
@@ -99,7 +99,7 @@ def _conjugate_gradients(system: FieldSystem, x: Tensor, steps: int) -> Tensor:
         residual.addcmul_(length, image, value=-1.0)
         before, along = along, dot(residual, residual)
         direction = torch.addcmul(residual, along / before.clamp_min(tiny), direction)
-    return x * root
+    return x.view(system.pull.shape) * root
 
 
 def solve_robust(

@@ -62,11 +62,16 @@ def _to_blocks(levels: Tensor, basis: Tensor) -> Tensor:
     """Coefficients ``(h, w, 8, 8)`` of the whole blocks of ``(H, W)``."""
     rows, columns = (side // _BLOCK for side in levels.shape)
     whole = levels[: rows * _BLOCK, : columns * _BLOCK]
-    return basis @ whole.reshape(rows, _BLOCK, columns, _BLOCK).transpose(1, 2) @ basis.T
+    return _transformed(whole.reshape(rows, _BLOCK, columns, _BLOCK), basis).transpose(1, 2)
+
+
+def _transformed(blocks: Tensor, basis: Tensor) -> Tensor:
+    """``basis @ block @ basis.T`` of every block of ``(h, 8, w, 8)``, as few large products."""
+    return (basis @ (blocks.reshape(-1, _BLOCK) @ basis.T).view(len(blocks), _BLOCK, -1)).view(blocks.shape)
 
 
 def _table(like: Tensor) -> Tensor:
-    return torch.tensor(_LUMA_STEPS, device=like.device, dtype=like.dtype).view(_BLOCK, _BLOCK)
+    return like.new_tensor(_LUMA_STEPS).view(_BLOCK, _BLOCK)
 
 
 def _first_edge(levels: Tensor, axis: int) -> int:
@@ -143,7 +148,7 @@ def clean(image_01: Tensor, grid_pixels: int) -> Tensor:
     total = torch.zeros_like(levels)
     for row, column in _SHIFTS:
         blocks = _to_blocks(wide[row:, column:], basis)
-        kept = basis.T @ (blocks * (blocks.abs() >= threshold)) @ basis
-        kept = kept.transpose(1, 2).flatten(2, 3).flatten(0, 1)
+        kept = (blocks * (blocks.abs() >= threshold)).transpose(1, 2)
+        kept = _transformed(kept, basis.T).flatten(2, 3).flatten(0, 1)
         total += kept[_BLOCK - row :, _BLOCK - column :][:height, :width]
     return (image_01 + (total / len(_SHIFTS) - levels) / 255.0).clamp(0.0, 1.0)

@@ -41,8 +41,6 @@ _LEAST_GAIN, _MOST_TURN_DEG, _MOST_SHIFT = 0.1, 8.0, 0.8
 #: Relative standard deviation, under the poses of a tracker, of the distance between two cameras and of the
 #: scene's median depth; measured on 85 pairs of two trackers (docs/how-to/poses.md).
 LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.05
-#: The user is warned if the scale of a refined pose is less certain than this.
-MOST_SCALE_SPREAD = 0.1
 # The user is warned if the pose that fits best changes log depth by more than this, in the median.
 _MOST_SPREAD = 0.13
 # Straightening: residual above which a match counts for less, pixels; pull of the 20 coefficients towards 0,
@@ -111,8 +109,7 @@ def refine_views(
     if far := _too_far(before, after, *pose_change(given, Ts)):
         return tuple(rights), replace(report, status="kept", warnings=(*filter(None, far), *units))
     if not (rig or measured):
-        Ts, spread, uncertain = _rescaled(tracks, given, Ts, before)
-        doubts += uncertain
+        Ts, spread = _rescaled(tracks, given, Ts, before)
     bends = [
         None if not before[v] > fits_px else fit_displacement(tracks.view(v), T, views.rights[v].shape)
         for v, T in enumerate(Ts)
@@ -153,8 +150,8 @@ def refined_scale(refined: np.ndarray, given: np.ndarray, misfit: float) -> tupl
 
 def _rescaled(
     tracks: Tracks, given: np.ndarray, Ts: np.ndarray, before: np.ndarray
-) -> tuple[np.ndarray, float, tuple[str, ...]]:
-    """Refined poses of a tracker, scaled by both baselines and scene; the spread of the scale; a warning."""
+) -> tuple[np.ndarray, float]:
+    """Refined poses of a tracker, scaled by both baselines and scene, and the spread of the scale."""
     refined, shifts = solve_inverse_depth(tracks, Ts), []
     depths = refined, np.zeros_like(refined)
     for seen, K, T in zip(tracks.seen, tracks.K_rights, Ts, strict=True):
@@ -162,19 +159,9 @@ def _rescaled(
         shifts.append(np.linalg.norm(here - far, axis=1))
     misfit = float(np.nanmean(before) / max(np.median(np.concatenate(shifts)), 1e-6))
     factor, spread = refined_scale(refined, solve_inverse_depth(tracks, given), misfit)
-    if not np.isfinite(factor):
-        return Ts, float("inf"), ()
-    Ts = Ts.copy()
-    Ts[:, :3, 3] *= factor
-    if spread <= MOST_SCALE_SPREAD:
-        return Ts, spread, ()
-    warning = (
-        f"The scale of the refined pose is uncertain by {100 * spread:.0f} % (one standard deviation): "
-        "the given baseline and the depth of the scene under the given pose disagree. If the distance "
-        "between the cameras is measured, say so (measured_baseline=True, --baseline); otherwise give "
-        "known points, or views from further apart."
-    )
-    return Ts, spread, (warning,)
+    scaled = Ts.copy()
+    scaled[:, :3, 3] *= factor
+    return (scaled, spread) if np.isfinite(factor) else (Ts, float("inf"))
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,6 +57,8 @@ OWN_METRES = math.log(1.9)
 #: Distance of matches from their epipolar lines, under the best pose near the given one, that is reported,
 #: and that is not trusted; pixels of the grid of the matches.
 EPIPOLAR_PX, EPIPOLAR_WRONG = 2.0, 4.0
+#: A refined pose whose scale is less certain than this is not trusted, unless known depths give the scale.
+MOST_SCALE_SPREAD = 0.1
 #: Known depths that fix a scale and a shift, and show when one of them is wrong.
 LEAST_POINTS = 3
 #: A given range is too narrow if this share of the matches lies on its first or last plane.
@@ -92,6 +94,7 @@ class Indicators:
     view_deg: float = math.nan  # horizontal field of view that K gives the left image
     own_ratio: float = math.nan  # median of the depth over a metric prior's depth
     epipolar_px: float = math.nan  # median distance of matches from their epipolar lines, the worst view's
+    scale_spread: float = math.nan  # relative standard deviation of a refined pose's scale, if in metres
     off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
     doubts: tuple[str, ...] = ()  # warnings about the input, each of which forbids trust
     mistakes: tuple[str, ...] = ()  # of a given pose, that would explain its misfit (``pose.mistakes``)
@@ -189,6 +192,8 @@ def read_indicators(
             more |= _points_indicators(matches, evidence.points)
     if pose is not None:
         more["epipolar_px"] = max((px for px in pose.residual_px if not math.isnan(px)), default=math.nan)
+        if has_unit and pose.scale_spread is not None:
+            more["scale_spread"] = pose.scale_spread
         if pose.status == "mistaken":
             more["mistakes"] = tuple(sentence for sentence in pose.warnings if sentence != INVERSE)
     if evidence.points is not None:
@@ -301,6 +306,12 @@ def _reasons(run: Indicators) -> list[str]:
     if 0 < run.points < LEAST_POINTS and math.isnan(run.matched):
         reasons.append(
             f"Too few known depths to fix both scale and shift, {run.points}; give at least {LEAST_POINTS}."
+        )
+    if run.scale_spread > MOST_SCALE_SPREAD and not run.points:
+        reasons.append(
+            f"The scale of the refined pose is uncertain by {100 * min(run.scale_spread, 1):.0f} %: baseline and "
+            "depth of the scene under the given pose disagree. Give the measured distance of the cameras "
+            "(--baseline, measured_baseline=True), or known points."
         )
     if run.off_matches > OFF_MATCHES and not run.points:
         reasons.append(

@@ -25,7 +25,8 @@ def test_a_good_run_is_trusted_in_silence():
     assert nothing.status == "not judged" and not nothing.trusted and "not judged" in nothing.sentence
     for signs in (
         {"own_ratio": 1.4, "view_deg": 21.0},
-        {"epipolar_px": 1.5},
+        {"epipolar_px": 1.5, "scale_spread": 0.09},
+        {"scale_spread": 0.2, "points": 99},  # known depths give the scale
         {"on_edge": True},  # a street's sky
         {"order": 0.0, "spread": 0.1},  # a scene that is nearly flat
         {"order": 0.1, "matched": 0.95},  # a poor prior under good matches
@@ -58,6 +59,7 @@ def test_a_good_run_is_trusted_in_silence():
         ({"baseline_m": 0.00012}, "0.12 mm"),
         ({"order": -0.9, "doubts": ("K is for another image.",)}, "depth: K is for another image"),
         ({"off_matches": 0.4}, "differs by 49 %"),
+        ({"scale_spread": 0.16}, "uncertain by 16 %"),
     ],
 )
 def test_reasons(signs, words):
