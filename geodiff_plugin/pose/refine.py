@@ -102,14 +102,13 @@ def refine_views(
     after, worst = median_residuals(tracks, Ts), int(np.argmax(np.nan_to_num(before)))
     residual_px, matches = tuple(before.tolist()), tuple(map(float, tracks.seen.sum(1)))
     report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
-    doubts, spread = undecided(tracks, Ts, free), None
+    doubts = undecided(tracks, Ts, free)
     if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
         sentences = _misfit(before, worst, ", and no pose near it leaves clearly less. ")
         return tuple(rights), replace(report, status="kept", warnings=sentences + doubts + units)
     if far := _too_far(before, after, *pose_change(given, Ts)):
         return tuple(rights), replace(report, status="kept", warnings=(*filter(None, far), *units))
-    if not (rig or measured):
-        Ts, spread = _rescaled(tracks, given, Ts, before)
+    Ts, spread = (Ts, None) if rig or measured else _rescaled(tracks, given, Ts, before)
     bends = [
         None if not before[v] > fits_px else fit_displacement(tracks.view(v), T, views.rights[v].shape)
         for v, T in enumerate(Ts)

@@ -192,14 +192,13 @@ def read_indicators(
             more |= _points_indicators(matches, evidence.points)
     if pose is not None:
         more["epipolar_px"] = max((px for px in pose.residual_px if not math.isnan(px)), default=math.nan)
-        if has_unit and pose.scale_spread is not None:
-            more["scale_spread"] = pose.scale_spread
         if pose.status == "mistaken":
             more["mistakes"] = tuple(sentence for sentence in pose.warnings if sentence != INVERSE)
     if evidence.points is not None:
         more["points"] = int((evidence.points.confidence > 0).sum())
     if rights and has_unit:
         more["baseline_m"] = float(rights[0].T_right_from_left[:3, 3].norm())
+        more["scale_spread"] = (pose and pose.scale_spread) or math.nan
     width = evidence.native_left.shape[-1]
     return Indicators(
         **more,
@@ -309,9 +308,9 @@ def _reasons(run: Indicators) -> list[str]:
         )
     if run.scale_spread > MOST_SCALE_SPREAD and not run.points:
         reasons.append(
-            f"The scale of the refined pose is uncertain by {100 * min(run.scale_spread, 1):.0f} %: baseline and "
-            "depth of the scene under the given pose disagree. Give the measured distance of the cameras "
-            "(--baseline, measured_baseline=True), or known points."
+            f"The scale of the refined pose is uncertain by {100 * min(run.scale_spread, 1):.0f} %: the "
+            "baseline and the depth of the scene under the given pose disagree. Give the measured distance "
+            "of the cameras (--baseline, measured_baseline=True), or known points."
         )
     if run.off_matches > OFF_MATCHES and not run.points:
         reasons.append(

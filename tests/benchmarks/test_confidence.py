@@ -74,6 +74,7 @@ def test_deciles_of_a_promise_that_is_kept_by_half():
     assert found[1].kept == pytest.approx(0.75) and found[1].promised == pytest.approx(0.975)
 
 
+@pytest.mark.slow
 def test_the_command_prints_constants_that_can_be_pasted(capsys):
     main(data=["synthetic:2@160x120"], resolution=64)
     printed, names = capsys.readouterr().out, {}

@@ -179,6 +179,7 @@ def test_a_map_of_another_model_as_the_prior(geodiff, pair_files, textured_plane
     assert np.median(np.abs(np.load("out/depth.npy") / truth - 1)) < 0.05
 
 
+@pytest.mark.slow
 def test_bench(monkeypatch, geodiff, prior):
     """The tiny prior stands in for the bundled one, and this process for the fresh ones."""
 

@@ -165,6 +165,7 @@ def test_the_notebook_is_kept_without_outputs():
     assert all(not cell.get("outputs") and not cell.get("execution_count") for cell in cells)
 
 
+@pytest.mark.slow
 def test_the_notebook_runs_from_top_to_bottom(tmp_path):
     for name in ("nbclient", "nbformat", "ipykernel"):
         pytest.importorskip(name, reason=f"{name} is not installed")

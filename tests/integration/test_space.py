@@ -34,6 +34,7 @@ def test_card_has_what_a_space_needs():
 
 
 @pytest.mark.filterwarnings("ignore")  # the client's own
+@pytest.mark.slow
 def test_it_answers_the_client(address, tmp_path):
     client_module = pytest.importorskip("gradio_client")
     *files, true_m = write_plane(tmp_path)
