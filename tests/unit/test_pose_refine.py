@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
 from geodiff_plugin.pose.refine import fit_displacement, refine_views, straightened, undecided
 from geodiff_plugin.pose.solve import PosePrior, is_rig, settle_poses, solve_poses
 from geodiff_plugin.pose.tracks import Tracks, median_residuals, residuals_px, solve_inverse_depth
+from geodiff_plugin.runtime.verdict import read_indicators
 from geodiff_plugin.types import CameraView
 from tests.scenes import render_pair
 
@@ -237,6 +239,12 @@ def test_a_tracker_keeps_the_scene_and_a_measured_baseline_its_length(pair) -> N
     moved = np.log(np.linalg.norm(report.E[0][:3, 3]) / given_length)
     assert 0.2 < moved / np.log(length / given_length) < 1.2
     assert report.scale_spread > 0.05  # even where both lengths agree
+    left, rights, K = posed(pair, wrong)
+    seen = SimpleNamespace(
+        matches=None, points=None, pose=report, native_views=rights, native_left=left, warnings=()
+    )
+    assert read_indicators(seen, K).scale_spread == report.scale_spread
+    assert np.isnan(read_indicators(seen, K, has_unit=False).scale_spread)
 
 
 def test_views_are_used_as_given_where_no_better_pose_is_near(pair) -> None:
