@@ -306,13 +306,13 @@ def _reasons(run: Indicators) -> list[str]:
         reasons.append(
             f"Too few known depths to fix both scale and shift, {run.points}; give at least {LEAST_POINTS}."
         )
-    if run.scale_spread > MOST_SCALE_SPREAD and not run.points:
+    if run.scale_spread > MOST_SCALE_SPREAD and run.points < LEAST_POINTS:
         reasons.append(
             f"The scale of the refined pose is uncertain by {100 * min(run.scale_spread, 1):.0f} %: the "
             "baseline and the depth of the scene under the given pose disagree. Give the measured distance "
             "of the cameras (--baseline, measured_baseline=True), or known points."
         )
-    if run.off_matches > OFF_MATCHES and not run.points:
+    if run.off_matches > OFF_MATCHES and run.points < LEAST_POINTS:
         reasons.append(
             f"The depth differs by {100 * math.expm1(run.off_matches):.0f} %, in the median, from what both "
             "views match: the scale or the shift was not found."
