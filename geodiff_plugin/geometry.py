@@ -149,9 +149,10 @@ def plane_rays(
 
     Source: Eq. 25 (eq:forward-warp_supp), with the products of matrices taken once.
     """
-    rays = _rays(size, K_left).flatten(1, 2).transpose(1, 2)  # (B, 3, H * W)
+    x, y, _ = _rays(size, K_left).flatten(1, 2)[:, None].unbind(-1)  # (B, 1, H * W) each, at z = 1
     M = K_right @ T_right_from_left[:, :3, :3]
-    A = (M[..., None] * rays[:, None]).sum(2)  # not a matrix product, which TF32 rounds by a quarter pixel
+    # Not a matrix product, which TF32 rounds by a quarter pixel.
+    A = torch.addcmul(M[..., 2:], M[..., 1:2], y).addcmul(M[..., :1], x)
     b = K_right @ T_right_from_left[:, :3, 3:]
     return PlaneRays(A, b)
 

@@ -158,9 +158,18 @@ def off_edges(target: Matches, depth_m: Tensor, error: Tensor) -> Matches:
 
 
 def highest(values: Tensor, reach: int) -> Tensor:
-    """The largest value of a square window, rows and columns one after the other."""
-    padded, window = F.pad(values, (reach,) * 4, mode="replicate"), 2 * reach + 1
-    return F.max_pool2d(F.max_pool2d(padded, (window, 1), 1), (1, window), 1)
+    """The largest value of a square window, rows and columns one after the other, by windows that double."""
+    side = 2 * reach + 1
+    values = F.pad(values, (reach,) * 4, mode="replicate")
+    for axis in (-1, -2):
+        covered = 1
+        while covered < side:
+            step, last = min(covered, side - covered), values.shape[axis]
+            values = torch.maximum(
+                values.narrow(axis, 0, last - step), values.narrow(axis, step, last - step)
+            )
+            covered += step
+    return values
 
 
 def _robust(residual: Tensor, noise: Tensor, error: Tensor, config: GuidanceConfig) -> Tensor:

@@ -216,10 +216,7 @@ def _crispness(depth_m: Tensor) -> Tensor:
     log_depth = depth_m.clamp_min(1e-9).log()[None, None]
     across, down = (log_depth.diff(dim=axis).abs() for axis in (-1, -2))
     step = torch.maximum(F.pad(across, (1, 0)), F.pad(down, (0, 0, 1, 0)))
-    ends, further = [highest(side, NEARBY) for side in (log_depth, -log_depth)], WIDE - NEARBY
-    near = ends[0] + ends[1]
-    # The largest of nine neighbouring windows is that of a window three times as wide.
-    wide = sum(F.max_pool2d(F.pad(end, (further,) * 4), 3, 1, dilation=further) for end in ends)
+    near, wide = (highest(log_depth, reach) + highest(-log_depth, reach) for reach in (NEARBY, WIDE))
     at_edge = (near > EDGE) & (wide < RISE * near)
     share = torch.where(at_edge, highest(step, NEARBY) / near, torch.nan)[..., WIDE:-WIDE, WIDE:-WIDE]
     return (share.flatten().nanmedian().nan_to_num(1.0) / CRISP).clamp(LEAST_CRISP, 1.0)

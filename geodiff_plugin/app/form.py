@@ -23,6 +23,7 @@ NUMBERS = {
     "cy": "cy, px",
     "cx_right": "Right camera's cx, px",
     "baseline": "Distance of the cameras, m",
+    "known_length": "Or a length in the left photograph, m",
     "near": "Nearest depth, m",
     "far": "Farthest depth, m",
 }
@@ -116,10 +117,24 @@ def _views() -> dict[str, Any]:
     drawn["cx_right"] = cx_right
     drawn["baseline"] = _optional("baseline", "as the calibration file says")
 
-    def show(chosen: str) -> list[Any]:
-        return [gr.update(visible=seen) for seen in (chosen == "file", chosen != "file", chosen == "numbers")]
+    with gr.Row(visible=False) as length:
+        drawn["known_length"] = _optional("known_length", "such as a door's height")
+        drawn["ends"] = ends = gr.Textbox(
+            label="Its two ends, px", placeholder="tap them on the photograph", max_lines=1, elem_id="ends"
+        )
 
-    way.change(show, way, [calibration, lens, cx_right], queue=False, api_visibility="private")
+    def show(chosen: str) -> list[Any]:
+        shown = chosen == "file", chosen != "file", chosen == "numbers", chosen == "photographs"
+        return [gr.update(visible=seen) for seen in shown]
+
+    def tap(before: str | None, event: gr.SelectData) -> str:
+        """The pixels of both ends; a third tap begins anew."""
+        first = (before or "").split(",")
+        return ", ".join([*(first if len(first) == 2 else []), *map(str, event.index)])
+
+    quick: dict[str, Any] = {"queue": False, "api_visibility": "private"}
+    way.change(show, way, [calibration, lens, cx_right, length], **quick)
+    drawn["left"].select(tap, ends, ends, show_progress="hidden", **quick)
     return drawn
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import secrets
 import tempfile
 import threading
@@ -59,12 +60,14 @@ def options_of(
     baseline: float | None = None,
     cx_right: float | None = None,
     lens: dict[str, float | None] | None = None,
+    known_length: float | None = None,
+    ends: str | None = None,
     **run: Any,
 ) -> DepthOptions:
     """The fields of a visitor as options of ``geodiff depth``; ``None`` is an empty field.
 
     ``way`` is a key of ``CAMERA_WAYS``; fields of another are left out. In ``lens`` fy is fx, and cx and cy
-    the middle of the image, where they are empty.
+    the middle of the image, where they are empty. ``known_length``, metres, lies between the pixels ``ends``.
     """
     paths, sizes = [], []
     for name, path in (("the left photograph", left), ("the right photograph", right)):
@@ -83,9 +86,17 @@ def options_of(
     missing = [name for name, value in (("fx", given.get("fx")), ("baseline", baseline)) if value is None]
     if way == "numbers" and missing:
         bad_value(" and ".join(missing), "given", "nothing", "fx is in pixels, the baseline in metres.")
-    if way == "photographs" and baseline is None:
-        cure = "Photographs have no unit: measure how far the two cameras were from each other, in metres."
+    if way == "photographs" and baseline is None and known_length is None:
+        cure = (
+            "Photographs have no unit: measure how far apart the cameras were, or a length in the left one."
+        )
         bad_value("the distance of the cameras", "given", "nothing", cure)
+    numbers = re.findall(r"\d+(?:\.\d+)?", ends or "")
+    if way == "photographs" and known_length is not None:
+        if len(numbers) != 4:
+            cure = "Tap both on the left photograph, or type x1, y1, x2, y2."
+            bad_value("the ends of the known length", "two pixels", repr(ends or ""), cure)
+        run["known_length"] = ",".join([*numbers, f"{known_length}"])
     if way != "file" and "fx" in given:
         middle = {c: (side - 1) / 2 for c, side in zip(("cx", "cy"), sizes[0], strict=True)}
         run |= {"fy": given["fx"]} | middle | given
@@ -96,7 +107,7 @@ def options_of(
         baseline=baseline,
         cx_right=cx_right if way == "numbers" else None,
         estimate_pose=way == "photographs",
-        export=("glb",),
+        export=("glb", "mesh"),
         **run,
     )
 

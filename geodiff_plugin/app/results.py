@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.app import look
 from geodiff_plugin.cli.depth import Job
-from geodiff_plugin.cli.outputs import cameras_of, cloud_of, single_map
+from geodiff_plugin.cli.outputs import cameras_of, single_map, surface_of
 from geodiff_plugin.formats import write_glb
 from geodiff_plugin.formats.out import REPORT
 from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, ticks
@@ -255,7 +255,7 @@ def _write_readings(path: Path, readings: Sequence[Reading]) -> None:
 
 def write_scene(path: Path, job: Job, least_confidence: float) -> int:
     """Cloud and cameras as GLB, light enough for a browser; how many points there are in all."""
-    cloud = cloud_of(job.output, job.inputs.left, least_confidence)
+    cloud = surface_of(job.output, job.inputs.left, least_confidence)
     write_glb(path, cloud.thinned(MOST_POINTS_SHOWN), cameras_of(job.output, job.inputs.guidance))
     return len(cloud.points_m)
 
@@ -271,7 +271,7 @@ def files_of(job: Job, pixels: Sequence[tuple[int, int]] = ()) -> list[Path]:
     for path in (*job.options.photographs().values(), *job.options.calib):
         report = report.replace(str(path), path.name)
     (folder / REPORT).write_text(report, encoding="utf-8")
-    wanted = f"depth_mm.png depth.npy depth.png confidence.npy cloud.ply cloud.glb {REPORT}".split()
+    wanted = f"depth_mm.png depth.npy depth.png confidence.npy cloud.ply cloud.glb mesh.glb {REPORT}".split()
     others = sorted({path.name for path in folder.iterdir()} - {*wanted, EVERYTHING, SCENE})
     paths = [folder / name for name in (*wanted, *others) if (folder / name).is_file()]
     with ZipFile(folder / EVERYTHING, "w", ZIP_STORED) as archive:

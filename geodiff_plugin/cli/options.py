@@ -85,7 +85,9 @@ class DepthOptions(RunOptions):
     out: Path | None = _output(None, "Folder; geodiff-out, or -2 and so on if taken.", "--out", "-o")
     overwrite: bool = _output(False, "Write into a folder that holds files; do finished pairs anew.")
     strict: bool = _output(False, "End with an error if the result is not to be trusted.")
-    export: tuple[str, ...] = _output((), "Also write glb or colmap; repeatable.", choices=("glb", "colmap"))
+    export: tuple[str, ...] = _output(
+        (), "glb (cloud), mesh (textured, GLB) or colmap; repeatable.", choices=("glb", "mesh", "colmap")
+    )
     quiet: bool = _output(False, "No progress bar, no summary.", "--quiet", "-q")
     json: bool = _output(False, "Print the report instead of the summary.")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,10 @@ from geodiff_plugin.cli.inputs import Inputs
 from geodiff_plugin.cli.options import DepthOptions, told_apart
 from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.formats import (
-    Cloud,
     check_file,
     flying_points,
     make_cloud,
+    make_mesh,
     write_colmap,
     write_depth_mm,
     write_depth_npy,
@@ -240,27 +240,36 @@ def cameras_of(
     return ((K, np.eye(4), (depth_m.shape[1], depth_m.shape[0])), *rights)
 
 
-def cloud_of(output: MetricDepthOutput, left: np.ndarray, least_confidence: float) -> Cloud:
-    """Points of at least this confidence in the colours of ``left``, without flying points."""
+def surface_of(
+    output: MetricDepthOutput,
+    left: np.ndarray,
+    least_confidence: float,
+    make: Callable[..., Any] = make_cloud,
+) -> Any:
+    """What ``make`` makes of the pixels of at least this confidence, in the colours of ``left``.
+
+    ``make`` is ``make_cloud`` or ``make_mesh``; points that fly are left out.
+    """
     depth_m = single_map(output.prediction)
     keep = ~flying_points(depth_m)
     if output.confidence is not None:
         keep &= single_map(output.confidence) >= least_confidence
-    return make_cloud(depth_m, left, np.asarray(output.K)[0].astype(np.float64), keep)
+    return make(depth_m, left, np.asarray(output.K)[0].astype(np.float64), keep)
 
 
 def write_exports(folder: Path, output: MetricDepthOutput, inputs: Inputs, options: DepthOptions) -> None:
     """Write what ``--export`` asks for, and images of a COLMAP model that were undistorted."""
-    cloud = cloud_of(output, inputs.left, options.min_confidence)
-    cameras = cameras_of(output, inputs.guidance)
-    if "glb" in options.export:
-        write_glb(folder / "cloud.glb", cloud, cameras)
+    shown, cameras = (output, inputs.left, options.min_confidence), cameras_of(output, inputs.guidance)
+    for name, file, make in (("glb", "cloud.glb", make_cloud), ("mesh", "mesh.glb", make_mesh)):
+        if name in options.export:
+            write_glb(folder / file, surface_of(*shown, make), cameras)
     if "colmap" in options.export:
         names = told_apart(options.photographs().values())
         if inputs.undistorted:
             views = [inputs.left, *(image.permute(1, 2, 0).numpy() for image in inputs.guidance.rights)]
             names = [write_undistorted(folder, image, number) for number, image in enumerate(views, 1)]
-        write_colmap(folder, [(name, *view) for name, view in zip(names, cameras, strict=True)], cloud)
+        named = [(name, *view) for name, view in zip(names, cameras, strict=True)]
+        write_colmap(folder, named, surface_of(*shown))
 
 
 def _map(path: Path) -> np.ndarray:

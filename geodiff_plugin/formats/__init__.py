@@ -7,7 +7,7 @@ from typing import Any
 
 #: What other programs use, by module; imported on first use, since some of them need torch.
 _NAMES = {
-    "clouds": ("Cloud", "flying_points", "make_cloud", "write_glb", "write_ply"),
+    "clouds": ("Cloud", "flying_points", "make_cloud", "make_mesh", "write_glb", "write_ply"),
     "depth": ("read_depth_png", "read_pfm", "read_points", "write_depth_mm", "write_depth_npy", "write_pfm"),
     "files": ("check_file", "read_matrix", "read_text"),
     "images": ("as_image_01", "picture_size", "read_image"),

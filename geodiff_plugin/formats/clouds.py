@@ -1,14 +1,14 @@
-"""Coloured point clouds from depth (Eq. 9, unprojection) without flying points, as PLY and binary glTF."""
+"""Point clouds and textured meshes from depth (Eq. 9, unprojection), as PLY and binary glTF."""
 
 from __future__ import annotations
 
-import json
-import struct
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from PIL import Image
 
 from geodiff_plugin._camera_checks import check_intrinsics
 from geodiff_plugin._checks import bad_value
@@ -17,18 +17,19 @@ from geodiff_plugin.formats.files import PathLike
 from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
 #: Depth change from one pixel to the next, as a share of the nearer depth: at a focal length of 500 px of a
 #: surface seen at 87 degrees from its normal.
 RELATIVE_STEP = 0.04
 #: A corner of a flat surface has three neighbours on it, a one-pixel ramp along an edge has two.
 FEWEST_NEIGHBOURS = 3
-#: Of binary glTF: the marks of its head and chunks, the types of numbers by numpy's, of lists and of meshes.
-MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
-COMPONENTS = {"f": 5126, "B": 5121, "I": 5125}
-ATTRIBUTES, INDICES, POINTS, LINES = 34962, 34963, 0, 1
+#: Upper bound on the points of a mesh; a finer depth map is thinned.
+MESH_POINTS = 300_000
 PYRAMID_SHARE = 0.08  # of the cloud's median depth
 CAMERA_COLOURS = ((255, 255, 255), (255, 170, 0), (0, 200, 255), (160, 255, 120))
-EDGES = np.array([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1], dtype=np.uint32)
+EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
 
 
 def _usable(depth_m: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
@@ -103,6 +104,39 @@ def _cloud_strips(
         yield points, np.rint(np.clip(image_01[rows][use], 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
+def make_mesh(
+    depth_m: np.ndarray, image_01: np.ndarray, K: np.ndarray, valid: np.ndarray | None = None
+) -> Trimesh:
+    """The surface through the points of ``make_cloud``, arguments as there, textured with the image.
+
+    It has at most ``MESH_POINTS`` points, and no triangle across a step in depth, as of ``flying_points``.
+    """
+    from trimesh import Trimesh
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    depth_m, sides = np.asarray(depth_m, np.float64), depth_m.shape
+    stride = max(1, math.ceil(math.sqrt(depth_m.size / MESH_POINTS)))
+    rows, columns = (np.arange(stride // 2, side, stride) for side in sides)
+    z = np.where(_usable(depth_m, valid), depth_m, np.nan)[np.ix_(rows, columns)]
+    u, v = np.meshgrid(columns, rows)
+    points = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(check_intrinsics(K)).T * z[..., None]
+    index = np.arange(z.size).reshape(z.shape)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    faces = np.stack([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3)
+    corners = z.flatten()[faces]
+    nearest = corners.min(1)  # NaN, and so no triangle, where a depth is unknown
+    whole = corners.max(1) - nearest <= stride * RELATIVE_STEP * nearest
+    uv = np.stack([(u + 0.5) / sides[1], 1.0 - (v + 0.5) / sides[0]], -1)
+    texture = Image.fromarray(np.rint(np.clip(image_01, 0.0, 1.0) * 255.0).astype(np.uint8))
+    texture.format = "JPEG"  # how the file will hold it
+    material = PBRMaterial(baseColorTexture=texture, metallicFactor=0.0, roughnessFactor=1.0)
+    visual = TextureVisuals(uv=uv.reshape(-1, 2), material=material)
+    mesh = Trimesh(points.reshape(-1, 3), faces[whole], visual=visual, process=False)
+    mesh.remove_unreferenced_vertices()
+    return mesh
+
+
 def write_ply(
     path: PathLike,
     depth_m: np.ndarray,
@@ -153,55 +187,40 @@ def _pyramid(K: np.ndarray, E: np.ndarray, size: tuple[int, int], length_m: floa
 
 
 def write_glb(
-    path: PathLike, cloud: Cloud, cameras: Sequence[tuple[np.ndarray, np.ndarray, tuple[int, int]]] = ()
+    path: PathLike,
+    shape: Cloud | Trimesh,
+    cameras: Sequence[tuple[np.ndarray, np.ndarray, tuple[int, int]]] = (),
 ) -> None:
-    """Write a cloud, which may be empty, and its cameras as GLB, whole or not at all.
+    """Write a cloud or a mesh, which may be empty, and its cameras as GLB, whole or not at all.
 
     ``cameras`` has ``(K, E, (width, height))`` of those to draw, E the pose in the left camera's frame. In
     glTF's axes, in metres, a point 1 m to the right of, above and before the camera is (1, 1, -1).
     """
-    accessors, views, data = list[dict[str, Any]](), list[dict[str, int]](), bytearray()
+    import trimesh
 
-    def add(array: np.ndarray, kind: str, target: int = ATTRIBUTES, **more: Any) -> int:
-        entry = {"bufferView": len(views), "componentType": COMPONENTS[array.dtype.char]}
-        accessors.append(entry | {"count": len(array), "type": kind} | more)
-        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes, "target": target})
-        data.extend(array.tobytes() + b"\0" * (-array.nbytes % 4))
-        return len(views) - 1
-
-    def mesh(name: str, mode: int, points_m: np.ndarray, colours: np.ndarray, **more: Any) -> dict[str, Any]:
-        positions = (points_m @ OPENGL_FROM_OPENCV[:3, :3]).astype("<f4")
-        bounds = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
-        rgba = np.pad(colours.astype(np.uint8), ((0, 0), (0, 1)), constant_values=255)
-        attributes = {"POSITION": add(positions, "VEC3", **bounds)}
-        attributes["COLOR_0"] = add(rgba, "VEC4", normalized=True)
-        return {"name": name, "primitives": [{"attributes": attributes, "mode": mode, "material": 0} | more]}
-
-    meshes, length_m = [], 1.0
-    if len(cloud.points_m):
-        meshes.append(mesh("cloud", POINTS, cloud.points_m, cloud.colours))
-        length_m = PYRAMID_SHARE * float(np.median(cloud.points_m[:, 2]))
+    # A mesh is built anew, as its own copy would lose the texture's format.
+    geometry: trimesh.PointCloud | Trimesh = (
+        trimesh.PointCloud(shape.points_m, colors=shape.colours)
+        if isinstance(shape, Cloud)
+        else trimesh.Trimesh(shape.vertices, shape.faces, visual=shape.visual, process=False)
+    )
+    scene, length_m = trimesh.Scene(), 1.0
+    if len(geometry.vertices):
+        length_m = PYRAMID_SHARE * float(np.median(geometry.vertices[:, 2]))
+        scene.add_geometry(geometry, geom_name="cloud" if isinstance(shape, Cloud) else "mesh")
     for number, (K, E, size) in enumerate(cameras):
-        colours = np.tile(CAMERA_COLOURS[number % len(CAMERA_COLOURS)], (5, 1))
-        corners, edges = _pyramid(np.asarray(K), np.asarray(E), size, length_m), add(EDGES, "SCALAR", INDICES)
-        meshes.append(mesh(f"camera {number}", LINES, corners, colours, indices=edges))
-    names = [mesh["name"] for mesh in meshes]
-    scene: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "geodiff-plugin"},
-        "extensionsUsed": ["KHR_materials_unlit"],
-        "scene": 0,
-        "scenes": [{"nodes": list(range(len(meshes)))} if meshes else {}],
-        "nodes": [{"name": name, "mesh": number} for number, name in enumerate(names)],
-        "meshes": meshes,
-        "materials": [{"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": {}}],
-        "buffers": [{"byteLength": len(data)}] if meshes else [],
-        "bufferViews": views,
-        "accessors": accessors,
-    }
-    scene = {name: value for name, value in scene.items() if value != []}  # glTF knows no empty lists
-    text = json.dumps(scene, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)  # as every chunk
-    chunks = struct.pack("<II", len(text), JSON_CHUNK) + text
-    chunks += struct.pack("<II", len(data), BINARY_CHUNK) + data if data else b""
+        lines = trimesh.load_path(_pyramid(np.asarray(K), np.asarray(E), size, length_m)[EDGES])
+        lines.colors = np.tile(CAMERA_COLOURS[number % len(CAMERA_COLOURS)], (len(lines.entities), 1))
+        scene.add_geometry(lines, geom_name=f"camera {number}")
+    for geometry in scene.geometry.values():
+        geometry.apply_transform(OPENGL_FROM_OPENCV)
+
+    def unlit(tree: dict[str, Any]) -> None:
+        """A photograph has its light already."""
+        for material in tree["materials"]:
+            material["extensions"] = {"KHR_materials_unlit": {}}
+        tree["extensionsUsed"] = ["KHR_materials_unlit"]
+
+    glb = scene.export(file_type="glb", include_normals=True, tree_postprocessor=unlit)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(struct.pack("<III", MAGIC, VERSION, 12 + len(chunks)) + chunks)
+        temporary.write_bytes(glb)

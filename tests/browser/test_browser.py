@@ -10,6 +10,7 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+from PIL import Image
 
 RUN_MS = 600_000
 NUMBER = r"(\d+\.\d+)"
@@ -91,6 +92,21 @@ def test_upload_run_measure_and_take_home(visitor, plane_files, tmp_path):
     assert {"confidence.npy", "depth_mm.png"} <= set(everything)
     tab(page, "Point cloud")
     page.wait_for_selector("#points >> text=points")
+
+
+def test_two_taps_give_the_ends_of_a_known_length(visitor, plane_files):
+    page = visitor(width=390)
+    upload(page, plane_files()[:2])
+    page.get_by_label("Estimate from the photographs").click()
+    for share, expected in ((0.25, r"\d+, \d+"), (0.5, r"\d+, \d+, \d+, \d+"), (0.75, r"\d+, \d+")):
+        box = page.locator("#left img").bounding_box()
+        page.mouse.click(box["x"] + share * box["width"], box["y"] + 0.5 * box["height"])
+        page.wait_for_function(
+            f"() => /^{expected}$/.test(document.querySelector('#ends textarea, #ends input').value)"
+        )
+    x, y = map(int, field(page, "ends").input_value().split(", "))
+    left = Image.open(plane_files()[0])
+    assert abs(x - 0.75 * left.width) < 3 and abs(y - 0.5 * left.height) < 3
 
 
 def is_stale(page) -> bool:

@@ -18,14 +18,14 @@ LENS = "-0.2,0.05,0,0"
 
 
 def test_exports_stand_beside_the_ply(geodiff, textured_plane, command):
-    out = Path("geodiff-out")
-    assert geodiff(*command, "--knob", "inner_steps=0", "--export", "glb", "--export", "colmap").code == 0
-    assert (out / "cloud.glb").read_bytes()[:4] == b"glTF"
+    out, exports = Path("geodiff-out"), "--export glb --export mesh --export colmap".split()
+    assert geodiff(*command, "--knob", "inner_steps=0", *exports).code == 0
+    assert all((out / f"{name}.glb").read_bytes()[:4] == b"glTF" for name in ("cloud", "mesh"))
     rig = read_calibration(out, image_names=("left.png", "right.png"), baseline_m=0.12)
     np.testing.assert_allclose(rig.E, textured_plane.E, atol=1e-6)
     # A later run without them leaves none of them behind.
     assert geodiff(*command, *QUICK, "-q", "--overwrite").code == 0
-    assert not (out / "cloud.glb").exists() and not (out / "cameras.txt").exists()
+    assert not any((out / name).exists() for name in ("cloud.glb", "mesh.glb", "cameras.txt"))
 
 
 def test_a_colmap_model_names_what_its_cameras_took(geodiff, command, pair_files):

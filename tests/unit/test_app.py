@@ -87,6 +87,10 @@ def test_fields_become_options_and_those_of_another_way_are_left_out(photographs
     Image.new("L", (64, 48)).save(tmp_path / "turned.jpg", exif=exif)
     turned = options_of(str(tmp_path / "turned.jpg"), photographs[1], "photographs", (), 0.3, 35.5, lens)
     assert turned.estimate_pose and turned.cx == 23.5 and turned.cx_right is None
+    known = {"known_length": 0.8, "ends": "12, 40.5, 50, 41"}
+    tapped = options_of(*photographs, "photographs", lens=lens, **known)
+    assert tapped.known_length == "12,40.5,50,41,0.8" and tapped.baseline is None
+    assert options_of(*photographs, "file", ("K.txt",), **known).known_length is None
 
 
 def test_what_a_visitor_left_out_or_gave_wrongly(photographs, monkeypatch):
@@ -99,6 +103,8 @@ def test_what_a_visitor_left_out_or_gave_wrongly(photographs, monkeypatch):
     ):
         with pytest.raises(ValueError, match=said):
             options_of(left, photographs[1], way)
+    with pytest.raises(ValueError, match="ends of the known length must be two pixels; got '3, 4'. Tap both"):
+        options_of(*photographs, "photographs", known_length=0.8, ends="3, 4")
     monkeypatch.setattr(job, "MOST_MEGAPIXELS", 0.003)
     with pytest.raises(ValueError, match="at most 0.003 megapixels; got 64x48"):
         options_of(*photographs, "file")

@@ -1,5 +1,6 @@
 """Maps, clouds, GLB and COLMAP files: written whole, and read back by code of others or of the test."""
 
+import io
 import json
 import struct
 from contextlib import nullcontext
@@ -11,11 +12,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from PIL import Image
 
 from geodiff_plugin.formats import (
     Cloud,
     atomic_path,
     flying_points,
+    make_mesh,
     read_calibration,
     read_depth_png,
     read_pfm,
@@ -164,18 +167,39 @@ def test_glb_turns_the_axes_and_its_cameras_look_at_the_cloud(tmp_path):
     scene, data = parse_glb(tmp_path / "a.glb")
     assert [mesh["name"] for mesh in scene["meshes"]] == ["cloud", "camera 0", "camera 1"]
     points, lines = (scene["meshes"][i]["primitives"][0] for i in (0, 2))
-    assert (points["mode"], lines["mode"]) == (0, 1) and accessor(scene, data, lines["indices"]).max() == 4
+    assert (points["mode"], lines["mode"]) == (0, 1)
     positions, colours = (points["attributes"][name] for name in ("POSITION", "COLOR_0"))
     assert accessor(scene, data, positions).tolist() == [[1, 1, -1], [0, 0, -2]]
     assert accessor(scene, data, colours).tolist() == [[255, 0, 9, 255], [1, 2, 3, 255]]
     assert [scene["accessors"][positions][key] for key in ("min", "max")] == [[0, 0, -2], [1, 1, -1]]
-    corners = accessor(scene, data, lines["attributes"]["POSITION"])
-    np.testing.assert_allclose(corners[0], [0.12, 0, 0], atol=1e-6)
-    middle = corners[1:].mean(0) - corners[0]
-    np.testing.assert_allclose(middle / np.linalg.norm(middle), [S, 0, -C], atol=1e-6)
-    write_glb(tmp_path / "a.glb", EMPTY)
+    corners = np.unique(accessor(scene, data, lines["attributes"]["POSITION"]).round(6), axis=0)
+    centre = np.linalg.norm(corners - [0.12, 0, 0], axis=1) < 1e-6
+    middle = corners[~centre].mean(0) - corners[centre][0]
+    np.testing.assert_allclose(middle / np.linalg.norm(middle), [S, 0, -C], atol=1e-5)
+    write_glb(tmp_path / "a.glb", EMPTY, [LEFT])
+    assert [mesh["name"] for mesh in parse_glb(tmp_path / "a.glb")[0]["meshes"]] == ["camera 0"]
+
+
+def test_a_mesh_wears_the_image_and_stops_at_steps_and_unknown_depths(tmp_path):
+    depth_m = np.where(np.arange(64) < 40, 2.0, 4.0) * np.ones((48, 1))
+    depth_m[:5, :5] = np.nan
+    image = np.mgrid[0:48, 0:64].transpose(1, 2, 0)[..., [0, 1, 1]] / 64
+    mesh = make_mesh(depth_m, image, K_60)
+    assert set(np.unique(mesh.vertices[mesh.faces][..., 2])) == {2.0, 4.0}
+    assert np.ptp(mesh.vertices[mesh.faces][..., 2], axis=1).max() == 0
+    assert len(mesh.faces) == 2 * 47 * (39 + 23) - 49  # a triangle at the corner of the hole stays
+    assert np.allclose(mesh.vertex_normals, [0, 0, -1])  # towards the camera
+    write_glb(tmp_path / "a.glb", mesh, [LEFT])
     scene, data = parse_glb(tmp_path / "a.glb")
-    assert scene["scenes"] == [{}] and data == b""
+    surface, at = scene["meshes"][0]["primitives"][0], scene["bufferViews"][scene["images"][0]["bufferView"]]
+    positions, uv, normals = (
+        accessor(scene, data, surface["attributes"][name]) for name in ("POSITION", "TEXCOORD_0", "NORMAL")
+    )
+    assert surface["mode"] == 4 and np.allclose(normals, [0, 0, 1])
+    px = np.stack([positions[:, 0], -positions[:, 1]], 1) / -positions[:, 2:] * 60 + K_60[:2, 2]
+    np.testing.assert_allclose(uv * [64, 48] - 0.5, px, atol=1e-4)
+    texture = Image.open(io.BytesIO(data[at["byteOffset"] : at["byteOffset"] + at["byteLength"]]))
+    assert texture.format == "JPEG" and np.abs(np.asarray(texture) / 255 - image).mean() < 0.02
 
 
 CAMERAS, IMAGES = SAMPLES["colmap"]
