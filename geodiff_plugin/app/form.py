@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -129,7 +130,7 @@ def _views() -> dict[str, Any]:
 
     def tap(before: str | None, event: gr.SelectData) -> str:
         """The pixels of both ends; a third tap begins anew."""
-        first = (before or "").split(",")
+        first = re.findall(r"\d+", before or "")
         return ", ".join([*(first if len(first) == 2 else []), *map(str, event.index)])
 
     quick: dict[str, Any] = {"queue": False, "api_visibility": "private"}
