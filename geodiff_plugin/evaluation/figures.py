@@ -57,7 +57,7 @@ def _save_png(picture: Any, path: Path) -> None:
     image = rasterised(picture) if isinstance(picture, Figure) else picture
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
-        image.quantize(256, kmeans=1, dither=Image.Dither.NONE).save(temporary, format="PNG", optimize=True)
+        image.quantize(256, dither=Image.Dither.NONE).save(temporary, format="PNG", optimize=True)
 
 
 def _style(index: int) -> dict[str, Any]:

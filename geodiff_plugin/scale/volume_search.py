@@ -20,8 +20,8 @@ from geodiff_plugin.scale.space import SPACES
 
 #: Cost beyond which a pixel is an outlier: occluded, a reflection, or wrong in the prior.
 COST_CLAMP = 0.35
-#: Pixels of the search; pixels of its coarse grid.
-SAMPLES, COARSE_SAMPLES = 6000, 1500
+#: Pixels of the search; groups of like value in which they are looked up.
+SAMPLES, GROUPS = 6000, 512
 #: Values of near, and of far, in the coarse grid, and in each of the two finer ones.
 COARSE_GRID, FINE_GRID = 48, 13
 #: The current state stays if its cost is this close to the best: a new one restarts scale and shift.
@@ -43,10 +43,30 @@ class ScaleSearch(NamedTuple):
     on_edge: Tensor
 
 
-def _lookup(
-    volume_cost: Tensor, in_view: Tensor, inverse_depth: Tensor, depth_m: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Mean clamped cost and share in view ``(M,)`` of candidate depths ``(M, P)``, linear between planes."""
+class Groups(NamedTuple):
+    """Pixels of a map in ``K`` groups of like value, summed: a candidate then costs ``K`` lookups."""
+
+    x: Tensor  # (K,) mean value
+    size: Tensor  # (K,) number of pixels
+    in_view: Tensor  # (D, K) how many of them a right view sees on each plane
+    cost: Tensor  # (D, K) sum of their clamped costs
+
+
+def group_pixels(x: Tensor, cost: Tensor, in_view: Tensor) -> Groups:
+    """Values ``x (P,)``, with their ``cost`` and ``in_view (D, P)``, in ``GROUPS`` of one size, or fewer."""
+    order, count = x.argsort(), min(GROUPS, len(x))
+    group = torch.arange(len(x), device=x.device) * count // len(x)
+
+    def summed(values: Tensor) -> Tensor:
+        total = values.new_zeros(*values.shape[:-1], count)
+        return total.index_add_(-1, group, values[..., order])
+
+    seen, size = in_view.to(cost), summed(torch.ones_like(x))
+    return Groups(summed(x) / size, size, summed(seen), summed(cost.clamp_max(COST_CLAMP) * seen))
+
+
+def _lookup(groups: Groups, inverse_depth: Tensor, depth_m: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean clamped cost and share in view ``(M,)`` of candidate depths ``(M, K)``, linear between planes."""
     planes = inverse_depth.shape[0]
     step = (inverse_depth[-1] - inverse_depth[0]) / (planes - 1)
     position = (1.0 / depth_m - inverse_depth[0]) / step
@@ -55,13 +75,14 @@ def _lookup(
     position = position.clamp(0, planes - 1).nan_to_num(0.0)
     below = position.floor().clamp_max(planes - 2).long()
     weight = position - below
-    cost = torch.lerp(volume_cost.gather(0, below), volume_cost.gather(0, below + 1), weight)
-    cost = cost.clamp_max(COST_CLAMP)
+
+    def between(table: Tensor) -> Tensor:
+        return torch.lerp(table.gather(0, below), table.gather(0, below + 1), weight)
+
     # Beyond the nearest plane the cost is unknown: it counts as an outlier, not as out of view.
-    cost = torch.where(inside, cost, torch.full_like(cost, COST_CLAMP))
-    counted = in_view.gather(0, below) | ~inside
-    count = counted.sum(1)
-    return (cost * counted).sum(1) / count.clamp_min(1), count / depth_m.shape[1]
+    cost = torch.where(inside, between(groups.cost), COST_CLAMP * groups.size).sum(1)
+    count = torch.where(inside, between(groups.in_view), groups.size).sum(1)
+    return cost / count.clamp_min(1.0), count / groups.size.sum()
 
 
 @torch.no_grad()
@@ -100,20 +121,21 @@ def search_scale(
     least = IN_VIEW_RECTIFIED if volume.rectified else IN_VIEW_POSED
     values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
 
-    def best_of(row: Tensor, near: Tensor, far: Tensor, every: int = 1) -> tuple[Tensor, Tensor, Tensor]:
+    def best_of(groups: Groups, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The best of candidate ends ``(M,)`` for the values of one map, and its cost, ``(1,)`` each."""
-        depth = SPACES[space].depth_at(row[None, ::every], near[:, None], far[:, None])
-        mean, share = _lookup(cost[:, ::every], in_view[:, ::every], volume.inverse_depth, depth)
+        depth = SPACES[space].depth_at(groups.x[None], near[:, None], far[:, None])
+        mean, share = _lookup(groups, volume.inverse_depth, depth)
         mean = mean + (share < least) * 1.0  # so one of these wins only if no pair keeps enough in view
         k = mean.argmin(keepdim=True)  # a 0-d index would be read back from the device
         return near[k], far[k], mean[k]
 
     results = []
     for b, row in enumerate(values):
-        near, far, mean = _coarse_to_fine(partial(best_of, row), low, high, row, len(at))
+        groups = group_pixels(row, cost, in_view)
+        near, far, mean = _coarse_to_fine(partial(best_of, groups), low, high, row)
         if current is not None:
             a, c = (v[b : b + 1] for v in current)
-            now = best_of(row, torch.minimum(a, c), torch.maximum(a, c))
+            now = best_of(groups, torch.minimum(a, c), torch.maximum(a, c))
             kept = now[2] <= mean + KEEP_MARGIN
             near, far, mean = (
                 torch.where(kept, old, new) for old, new in zip(now, (near, far, mean), strict=True)
@@ -125,7 +147,7 @@ def search_scale(
 
 
 def _coarse_to_fine(
-    best_of: Callable[..., tuple[Tensor, Tensor, Tensor]], low: float, high: float, like: Tensor, samples: int
+    best_of: Callable[..., tuple[Tensor, Tensor, Tensor]], low: float, high: float, like: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Near and far in [low, high], and their cost, ``(1,)`` each: a coarse grid, then two finer ones."""
     grid = torch.linspace(0, 1, COARSE_GRID, dtype=like.dtype, device=like.device)
@@ -133,7 +155,7 @@ def _coarse_to_fine(
     i, j = torch.triu_indices(COARSE_GRID, COARSE_GRID, 1, device=like.device)
     offsets = torch.linspace(-1, 1, FINE_GRID, dtype=like.dtype, device=like.device)
     ends = (torch.exp(log_low + log_span * grid[k]) for k in (i, j))
-    near, far, mean = best_of(*ends, every=max(1, samples // COARSE_SAMPLES))
+    near, far, mean = best_of(*ends)
     reach = log_span / (COARSE_GRID - 1)
     for _ in range(2):
         n = near.log() + reach * offsets.repeat_interleave(FINE_GRID)

@@ -15,7 +15,7 @@ from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.census import census, census_cost, grey_levels
 from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.sweep import sweep_planes
-from geodiff_plugin.scale.volume_search import _lookup
+from geodiff_plugin.scale.volume_search import _lookup, group_pixels
 from geodiff_plugin.types import CameraView
 from tests.golden.parts import scene, volume
 
@@ -79,23 +79,29 @@ def test_a_plane_costs_what_the_views_that_see_the_pixel_say():
 def test_a_candidate_costs_the_mean_of_what_is_in_view():
     """Beyond the nearest plane nothing is known: as bad as an outlier, and counted."""
     made = volume()
-    at = torch.arange(0, made.size[0] * made.size[1], 37)
+    at = torch.arange(0, made.size[0] * made.size[1], 3)
     cost, in_view = made.at_pixels(at)
-    planes, depth = made.inverse_depth.numpy(), 1.5 + 12 * _random(4, len(at))
-    found, share = _lookup(cost, in_view, made.inverse_depth, torch.from_numpy(depth).float())
-    for k, row in enumerate(depth):
-        total, count = 0.0, 0
-        for pixel, z in enumerate(row):
+    planes, x = made.inverse_depth.numpy(), _random(len(at), seed=1)
+    groups = group_pixels(torch.from_numpy(x).float(), cost, in_view)
+    assert len(at) > len(groups.x) == 512
+    depth = 1.5 + 12 * _random(4, 512)
+    found, share = _lookup(groups, made.inverse_depth, torch.from_numpy(depth).float())
+    parts = [np.argsort(x)[np.arange(len(at)) * 512 // len(at) == k] for k in range(512)]
+    np.testing.assert_allclose(groups.x, [x[part].mean() for part in parts], rtol=1e-5)
+    for row, mean, seen in zip(depth, found, share, strict=True):
+        total, count = 0.0, 0.0
+        for part, z in zip(parts, row, strict=True):
             position = (1 / z - planes[0]) / (planes[1] - planes[0])
             if position > len(planes) - 1:
-                total, count = total + 0.35, count + 1
+                total, count = total + 0.35 * len(part), count + len(part)
                 continue
             below = min(int(position), len(planes) - 2)
-            if in_view[below, pixel]:
-                between = np.interp(position, (below, below + 1), cost[below : below + 2, pixel])
-                total, count = total + min(between, 0.35), count + 1
-        assert float(found[k]) == pytest.approx(total / count, rel=1e-4)
-        assert float(share[k]) == pytest.approx(count / len(at))
+            for plane, weight in ((below, 1 - position + below), (below + 1, position - below)):
+                known = part[in_view.numpy()[plane, part]]
+                total += weight * np.minimum(cost.numpy()[plane, known], 0.35).sum()
+                count += weight * len(known)
+        assert float(mean) == pytest.approx(total / count, rel=1e-4)
+        assert float(seen) == pytest.approx(count / len(at), rel=1e-4)
 
 
 def test_the_photometric_error_is_ssim_in_a_gaussian_window_and_l1():
