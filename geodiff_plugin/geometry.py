@@ -152,8 +152,7 @@ def plane_rays(
     x, y, _ = _rays(size, K_left).flatten(1, 2)[:, None].unbind(-1)  # (B, 1, H * W) each, at z = 1
     M = K_right @ T_right_from_left[:, :3, :3]
     # Not a matrix product, which TF32 rounds by a quarter pixel.
-    A = torch.addcmul(M[..., 2:], M[..., 1:2], y).addcmul(M[..., :1], x)
-    b = K_right @ T_right_from_left[:, :3, 3:]
+    A, b = M[..., 2:] + M[..., 1:2] * y + M[..., :1] * x, K_right @ T_right_from_left[:, :3, 3:]
     return PlaneRays(A, b)
 
 

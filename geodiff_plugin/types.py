@@ -115,7 +115,6 @@ class MetricDepthOutput(BaseOutput):
             ``prediction``; ``None`` without ``output_uncertainty=True``, or with fewer than two members.
         latent: ``(N * E, 4, h, w)`` final latents, with ``output_latent=True``.
         relative: median unclipped relative depth, about [0, 1].
-        space: what the prior's relative map is affine in, a key of ``SPACES``, as ``"depth"``.
         scale: ``(N, E)`` softplus of the learnt scale.
         shift: ``(N, E)`` softplus of the learnt shift.
         global_scale: ``(N, E)`` metres, the pre-selected g_s of Eq. 16.
@@ -148,7 +147,6 @@ class MetricDepthOutput(BaseOutput):
     uncertainty: np.ndarray | torch.Tensor | None = None
     latent: torch.Tensor | None = None
     relative: np.ndarray | torch.Tensor | None = None
-    space: str | None = None
     scale: torch.Tensor | None = None
     shift: torch.Tensor | None = None
     global_scale: torch.Tensor | None = None

@@ -165,9 +165,8 @@ def highest(values: Tensor, reach: int) -> Tensor:
         covered = 1
         while covered < side:
             step, last = min(covered, side - covered), values.shape[axis]
-            values = torch.maximum(
-                values.narrow(axis, 0, last - step), values.narrow(axis, step, last - step)
-            )
+            shifted = (values.narrow(axis, first, last - step) for first in (0, step))
+            values = torch.maximum(*shifted)
             covered += step
     return values
 

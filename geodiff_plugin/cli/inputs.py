@@ -189,8 +189,7 @@ def _read_known(
         return depth_of_disparity(options.disparity, rig, size, "--disparity")
     if options.points is None:
         return None
-    scale, calibration = options.points_scale, options.points_calib
-    known = read_points(options.points, "--points", scale=scale, calibration=calibration)
+    known = read_points(options.points, "--points", scale=options.points_scale)
     if lens is None or known.shape[1] == 3:
         return known
     if known.shape[::-1] != size:

@@ -73,7 +73,6 @@ class DepthOptions(RunOptions):
     prior_map: Path | None = declare(None, "Another model's map of LEFT (or folder of maps) as the prior.")
     points: Path | None = declare(None, "Known depths: a map of LEFT, or points (.npy, text, .ply, .bin).")
     points_scale: float | None = declare(None, "Its units per metre: 1000 for mm.", above_0="units per metre")
-    points_calib: tuple[Path, ...] = declare((), "KITTI's lidar calibration for a .bin; twice for two files.")
     disparity: Path | None = declare(None, "Disparities of LEFT in a rectified rig, instead of --points.")
     points_confidence: Path | None = declare(None, "How far to rely on them, in [0, 1], of the same shape.")
     topic_left: str | None = declare(None, "Topic of the left images, where LEFT is a bag.", "--left")
@@ -184,7 +183,7 @@ class DepthOptions(RunOptions):
                 "Lengths differ from pair to pair.",
             ),
             (not self.calib, "cameras", *of_file),
-            (no_points, "points_scale points_calib", "given with --points", "no --points", ""),
+            (no_points, "points_scale", "given with --points", "no --points", ""),
             (not no_points, "disparity", "given in place of --points", "both", ""),
             (no_points and no_disparity, "points_confidence", *of_depths),
             (alone and no_disparity, "baseline cx_right", *second),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from geodiff_plugin._camera_checks import check_intrinsics, check_metres
+from geodiff_plugin._camera_checks import check_metres
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.formats.files import PathLike, check_file, open_image, read_npy, read_rows, read_text
+from geodiff_plugin.formats.files import PathLike, check_file, open_image, read_npy, read_rows
 from geodiff_plugin.formats.out import atomic_path
 
 if TYPE_CHECKING:  # which imports torch
@@ -23,11 +23,9 @@ LARGEST_MM, MILLIMETRES, KITTI_UNITS = 65535, 1000.0, 256.0
 #: Pixels of a strip: a map of float64 of so many is 8 MB.
 STRIP_PIXELS = 1 << 20
 MAP_FILES = "a map (H, W) as .npy, .npz, .pfm or 16-bit .png"
-KINDS = "a 16-bit PNG (mm), a .pfm or .npy map, or points as .npy, text, .ply or KITTI's .bin, in metres"
+KINDS = "a 16-bit PNG (mm), a .pfm or .npy map, or points as .npy, text or .ply, in metres"
 COLUMNS = (3, 4, 6)  # x y z, with an intensity, or with a colour
 NUMBER = re.compile(r"[-+]?(\d.*|\..*|nan|inf)", re.IGNORECASE)
-KITTI_ROW = re.compile(r"^\s*(\w+)\s*:(.*)$", re.MULTILINE)
-VELODYNE = "KITTI's calib/N.txt, or calib_velo_to_cam.txt together with calib_cam_to_cam.txt"
 
 
 def row_strips(height: int, width: int) -> Iterator[slice]:
@@ -128,26 +126,20 @@ def read_map(path: PathLike, name: str = "map") -> np.ndarray:
     return np.where(np.isfinite(values), values, np.nan)
 
 
-def read_points(
-    path: PathLike, name: str = "points", *, scale: float | None = None, calibration: Sequence[PathLike] = ()
-) -> np.ndarray:
+def read_points(path: PathLike, name: str = "points", *, scale: float | None = None) -> np.ndarray:
     """Read known depths of the left image: ``(H, W)`` float32 metres, 0 where unknown, or ``(N, 3)``.
 
     Points are in the left camera's frame: ``.npy`` or text of 3, 4 or 6 columns, or with a heading that names
-    x, y and z; ``.ply``; KITTI's velodyne ``.bin``, with its ``calibration``. ``scale`` is the units of the
-    file in a metre: 1000 for millimetres, 256 for KITTI's PNG.
+    x, y and z; ``.ply``. ``scale`` is the units of the file in a metre: 1000 for millimetres, 256 for
+    KITTI's PNG.
     """
     file = check_file(path, name, "a file of known depths")
     if scale is not None:
         check_number(scale, f"{name}-scale", 1e-9, 1e9)
     kind = file.suffix.lower()
-    if calibration and kind != ".bin":
-        bad_value(f"{name}-calib", "given with a velodyne .bin only", f"{file}")
     if kind == ".png":
         return read_depth_png(file, scale or MILLIMETRES, name)[0]
-    if kind == ".bin":
-        values = _velodyne(file, calibration, name)
-    elif kind == ".npy":
+    if kind == ".npy":
         values = read_npy(file, name, KINDS)
     else:
         values = {".pfm": read_pfm, ".ply": read_ply_points}.get(kind, _table)(file, name)
@@ -207,48 +199,6 @@ def read_ply_points(path: Path, name: str = "points") -> np.ndarray:
     if count is None or not 0 < int(count.group(1)) == len(points):
         expected = "a PLY file with vertices of x, y and z, all that it counts"
         bad_value(name, expected, path, "Is it cut off, or another format?")
-    return points
-
-
-def _camera_from_velodyne(paths: Sequence[PathLike], name: str) -> np.ndarray:
-    """``(4, 4)``: from the scanner's frame to that of the rectified left colour camera, which is camera 2."""
-    rows: dict[str, np.ndarray] = {}
-    for path in paths:
-        for key, words in KITTI_ROW.findall(read_text(path, name, VELODYNE)):
-            with suppress(ValueError):  # a row of words, such as the date
-                rows[key] = np.array(words.split(), dtype=np.float64)
-
-    def matrix(columns: slice, *keys: str) -> np.ndarray:
-        row, T = next((rows[key] for key in keys if key in rows), np.empty(0)), np.eye(4)
-        if row.size != T[:3, columns].size or not np.isfinite(row).all():
-            bad_value(name, VELODYNE, f"files without {' or '.join(keys)} of {T[:3, columns].size} numbers")
-        T[:3, columns] = row.reshape(3, -1)
-        return T
-
-    turn, shift, both = slice(0, 3), slice(3, 4), slice(0, 4)
-    if "R" in rows and "T" in rows:
-        moved = matrix(shift, "T") @ matrix(turn, "R")
-    else:
-        moved = matrix(both, "Tr_velo_to_cam", "Tr_velo_cam")
-    P = matrix(both, "P2", "P_rect_02")
-    beside = np.eye(4)  # camera 2 stands beside camera 0, in whose frame the rest is
-    beside[:3, 3] = np.linalg.solve(check_intrinsics(P[:3, :3], f"P2 of {name}"), P[:3, 3])
-    return beside @ matrix(turn, "R0_rect", "R_rect_00", "R_rect") @ moved
-
-
-def _velodyne(path: Path, calibration: Sequence[PathLike], name: str) -> np.ndarray:
-    """The points of a scan (float32 x, y, z, reflectance) before the left camera, ``(N, 3)`` metres."""
-    if not calibration:
-        cure = "The scanner has a frame of its own: x forward, y left, z up."
-        bad_value(f"{name}-calib", f"given with a .bin ({VELODYNE})", "nothing", cure)
-    scan = np.fromfile(path, dtype="<f4").astype(np.float64)
-    if path.stat().st_size % 16:
-        bad_value(name, "a velodyne .bin of whole points (4 float32 each)", path, "Is it cut off?")
-    T = _camera_from_velodyne(calibration, f"{name}-calib")
-    points = scan.reshape(-1, 4)[:, :3] @ T[:3, :3].T + T[:3, 3]
-    points = points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0)]
-    if not len(points):
-        bad_value(name, "a scan with points before the camera", f"{path} with none")
     return points
 
 

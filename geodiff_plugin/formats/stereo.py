@@ -17,7 +17,6 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value, warn
-from geodiff_plugin.formats.depth import KITTI_ROW
 from geodiff_plugin.formats.rigs import (
     Camera,
     CameraChoice,
@@ -115,7 +114,7 @@ def _kitti_cameras(available: Collection[int], choice: CameraChoice) -> tuple[in
 
 def read_kitti(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """``P_rect_02`` with ``S_rect_02`` of ``calib_cam_to_cam``, or ``P0`` to ``P3``; DrivingStereo's too."""
-    rows = {key: words.split() for key, words in KITTI_ROW.findall(texts[0])}
+    rows = {key: words.split() for key, words in re.findall(r"(?m)^\s*(\w+)\s*:(.*)$", texts[0])}
     named = {int(match[2]): match for match in map(PROJECTION.fullmatch, rows) if match}
     left, right = (named[camera] for camera in _kitti_cameras(named, choice))
     P = (array_of(rows[match[0]], (3, 4), match[0]) for match in (left, right))

@@ -38,11 +38,6 @@ class CostVolume:
     rights: tuple[CameraView, ...]  # grey, at the resolution of the sweep
     aligned: tuple[AlignedView, ...]  # the same, turned parallel to the left view
 
-    @property
-    def cost(self) -> Tensor:
-        """``(D, H, W)`` float32 in [0, 1], the costs of all cells, in four times the memory of ``levels``."""
-        return self.levels.float() / COST_LEVELS
-
     def at_pixels(self, index: Tensor) -> tuple[Tensor, Tensor]:
         """``cost (D, P)`` in [0, 1] and ``in_view (D, P)`` bool of pixels ``(P,)``: ``row * W + column``."""
         row, column = index // self.size[1], index % self.size[1]

@@ -172,7 +172,6 @@ def assemble_output(
         prediction=out(depth_m),
         uncertainty=out(uncertainty),
         relative=out(relative),
-        space=run.prior.space,
         scale=of_members("scale"),
         shift=of_members("shift"),
         global_scale=of_members("g_s"),

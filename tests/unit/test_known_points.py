@@ -93,44 +93,6 @@ def test_what_is_none_is_named_with_what_would_be(tmp_path, name, content, said)
         read_points(tmp_path / name)
 
 
-#: The scanner looks along x, its y to the left, z up; the camera sits 0.27 m before it.
-TR = "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 -0.27\n"
-P2 = "700 0 600 70 0 700 180 0 0 0 1 0"
-EYE = "1 0 0 0 1 0 0 0 1"
-
-
-@pytest.fixture
-def scan(tmp_path):
-    """One point 10 m before the scanner and 1 m to the left, one behind it."""
-    rows = np.array([[10.0, 1.0, 0.5, 0.3], [-5.0, 0.0, 0.0, 0.1]], "<f4")
-    (tmp_path / "0.bin").write_bytes(rows.tobytes())
-    return tmp_path / "0.bin"
-
-
-def test_a_velodyne_scan_with_either_calibration(tmp_path, scan):
-    (tmp_path / "object.txt").write_text(f"P2: {P2}\nR0_rect: {EYE}\n{TR}")
-    (tmp_path / "velo.txt").write_text("calib_time: 1-Jan\nR: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 -0.27\n")
-    (tmp_path / "cams.txt").write_text(f"R_rect_00: {EYE}\nP_rect_02: {P2}\n")
-    expected = [[-1.0 + 70 / 700, -0.5, 9.73]]  # camera 2 stands 0.1 m to the left of camera 0
-    for files in ([tmp_path / "object.txt"], [tmp_path / "velo.txt", tmp_path / "cams.txt"]):
-        np.testing.assert_allclose(read_points(scan, calibration=files), expected, rtol=1e-5)
-
-
-def test_a_velodyne_scan_that_cannot_be_placed(tmp_path, scan):
-    calib = tmp_path / "calib.txt"
-    calib.write_text(f"P2: {P2}\n")
-    for path, files, said in (
-        (scan, (), "given with a .bin"),
-        (scan, [calib], "KITTI's"),
-        (calib, [calib], "given with a velodyne .bin"),
-    ):
-        with pytest.raises(ValueError, match=f"points-calib must be {said}"):
-            read_points(path, calibration=files)
-    scan.write_bytes(scan.read_bytes()[:-3])
-    with pytest.raises(ValueError, match="cut off"):
-        read_points(scan, calibration=[calib])
-
-
 def test_units_by_number(tmp_path):
     write_depth_mm(tmp_path / "map.png", MAP * 0.256)  # the integers of KITTI's 1/256 m
     np.testing.assert_allclose(read_points(tmp_path / "map.png", scale=256), MAP, atol=4e-3)
