@@ -87,9 +87,7 @@ def options_of(
     if way == "numbers" and missing:
         bad_value(" and ".join(missing), "given", "nothing", "fx is in pixels, the baseline in metres.")
     if way == "photographs" and baseline is None and known_length is None:
-        cure = (
-            "Photographs have no unit: measure how far apart the cameras were, or a length in the left one."
-        )
+        cure = "Photographs have no unit: measure the distance of the cameras, or a length in the left one."
         bad_value("the distance of the cameras", "given", "nothing", cure)
     numbers = re.findall(r"\d+(?:\.\d+)?", ends or "")
     if way == "photographs" and known_length is not None:

@@ -194,11 +194,12 @@ def write_glb(
     """Write a cloud or a mesh, which may be empty, and its cameras as GLB, whole or not at all.
 
     ``cameras`` has ``(K, E, (width, height))`` of those to draw, E the pose in the left camera's frame. In
-    glTF's axes, in metres, a point 1 m to the right of, above and before the camera is (1, 1, -1).
+    glTF's axes, in metres, a point 1 m to the right of, above and before the camera is (1, 1, -1). Raises
+    ``ValueError`` if there is neither a point nor a camera.
     """
     import trimesh
 
-    # A mesh is built anew, as its own copy would lose the texture's format.
+    # Not a copy of the mesh: that would lose the texture's format.
     geometry: trimesh.PointCloud | Trimesh = (
         trimesh.PointCloud(shape.points_m, colors=shape.colours)
         if isinstance(shape, Cloud)
