@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import gradio as gr
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.app.job import CAMERA_WAYS, LIMITS, Priors, options_of
+from geodiff_plugin.app.job import CAMERA_WAYS, ENDS, LIMITS, Priors, options_of
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.options import PRESETS, help_of
@@ -24,7 +23,7 @@ NUMBERS = {
     "cy": "cy, px",
     "cx_right": "Right camera's cx, px",
     "baseline": "Distance of the cameras, m",
-    "known_length": "Or a length in the left photograph, m",
+    "known_length": "Instead: a length in the left photograph, m",
     "near": "Nearest depth, m",
     "far": "Farthest depth, m",
 }
@@ -121,7 +120,7 @@ def _views() -> dict[str, Any]:
     with gr.Row(visible=False) as length:
         drawn["known_length"] = _optional("known_length", "such as a door's height")
         drawn["ends"] = ends = gr.Textbox(
-            label="Its two ends, px", placeholder="tap them on the photograph", max_lines=1, elem_id="ends"
+            label="Its two ends, px", placeholder="tap them, best in full screen", max_lines=1, elem_id="ends"
         )
 
     def show(chosen: str) -> list[Any]:
@@ -130,12 +129,13 @@ def _views() -> dict[str, Any]:
 
     def tap(before: str | None, event: gr.SelectData) -> str:
         """The pixels of both ends; a third tap begins anew."""
-        first = re.findall(r"\d+", before or "")
+        first = ENDS.findall(before or "")
         return ", ".join([*(first if len(first) == 2 else []), *map(str, event.index)])
 
     quick: dict[str, Any] = {"queue": False, "api_visibility": "private"}
     way.change(show, way, [calibration, lens, cx_right, length], **quick)
     drawn["left"].select(tap, ends, ends, show_progress="hidden", **quick)
+    gr.on([drawn["left"].upload, drawn["left"].clear], lambda: "", outputs=ends, **quick)
     return drawn
 
 

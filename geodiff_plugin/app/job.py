@@ -29,6 +29,7 @@ CAMERA_WAYS = {
     "numbers": "Focal length and baseline",
     "photographs": "Estimate from the photographs",
 }
+ENDS = re.compile(r"-?\d+(?:\.\d+)?")
 #: A photograph of more is not decoded.
 MOST_MEGAPIXELS = 50
 
@@ -67,7 +68,7 @@ def options_of(
     """The fields of a visitor as options of ``geodiff depth``; ``None`` is an empty field.
 
     ``way`` is a key of ``CAMERA_WAYS``; fields of another are left out. In ``lens`` fy is fx, and cx and cy
-    the middle of the image, where they are empty. ``known_length``, metres, lies between the pixels ``ends``.
+    the middle of the image, where they are empty. ``known_length`` is in metres, between the pixels ``ends``.
     """
     paths, sizes = [], []
     for name, path in (("the left photograph", left), ("the right photograph", right)):
@@ -86,10 +87,11 @@ def options_of(
     missing = [name for name, value in (("fx", given.get("fx")), ("baseline", baseline)) if value is None]
     if way == "numbers" and missing:
         bad_value(" and ".join(missing), "given", "nothing", "fx is in pixels, the baseline in metres.")
-    if way == "photographs" and baseline is None and known_length is None:
+    if way == "photographs" and (baseline is None) == (known_length is None):
         cure = "Photographs have no unit: measure the distance of the cameras, or a length in the left one."
-        bad_value("the distance of the cameras", "given", "nothing", cure)
-    numbers = re.findall(r"\d+(?:\.\d+)?", ends or "")
+        got = "nothing" if baseline is None else "both"
+        bad_value("the distance of the cameras, or a known length,", "given", got, cure)
+    numbers = ENDS.findall(ends or "")
     if way == "photographs" and known_length is not None:
         if len(numbers) != 4:
             cure = "Tap both on the left photograph, or type x1, y1, x2, y2."

@@ -71,7 +71,7 @@ class DepthOptions(RunOptions):
     view_distortion: tuple[str, ...] = _camera((), "Lens of each --view, 0,0,0,0 for none; default LEFT's.")
     cropped: bool = _camera(False, "The principal point may lie outside: the images are crops.")
     prior_map: Path | None = declare(None, "Another model's map of LEFT (or folder of maps) as the prior.")
-    points: Path | None = declare(None, "Known depths: a map of LEFT, or points (.npy, text, .ply, .bin).")
+    points: Path | None = declare(None, "Known depths: a map of LEFT, or points (.npy, text, .ply).")
     points_scale: float | None = declare(None, "Its units per metre: 1000 for mm.", above_0="units per metre")
     disparity: Path | None = declare(None, "Disparities of LEFT in a rectified rig, instead of --points.")
     points_confidence: Path | None = declare(None, "How far to rely on them, in [0, 1], of the same shape.")
@@ -85,7 +85,7 @@ class DepthOptions(RunOptions):
     overwrite: bool = _output(False, "Write into a folder that holds files; do finished pairs anew.")
     strict: bool = _output(False, "End with an error if the result is not to be trusted.")
     export: tuple[str, ...] = _output(
-        (), "glb (cloud), mesh (textured, GLB) or colmap; repeatable.", choices=("glb", "mesh", "colmap")
+        (), "Also glb (cloud), mesh (textured, GLB) or colmap; repeatable.", choices=("glb", "mesh", "colmap")
     )
     quiet: bool = _output(False, "No progress bar, no summary.", "--quiet", "-q")
     json: bool = _output(False, "Print the report instead of the summary.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -241,15 +241,9 @@ def cameras_of(
 
 
 def surface_of(
-    output: MetricDepthOutput,
-    left: np.ndarray,
-    least_confidence: float,
-    make: Callable[..., Any] = make_cloud,
+    output: MetricDepthOutput, left: np.ndarray, least_confidence: float, make: Any = make_cloud
 ) -> Any:
-    """What ``make`` makes of the pixels of at least this confidence, in the colours of ``left``.
-
-    ``make`` is ``make_cloud`` or ``make_mesh``; points that fly are left out.
-    """
+    """A cloud, or by ``make_mesh`` a mesh, of the pixels of at least this confidence that do not fly."""
     depth_m = single_map(output.prediction)
     keep = ~flying_points(depth_m)
     if output.confidence is not None:

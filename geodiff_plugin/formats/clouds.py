@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from PIL import Image
 
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
 RELATIVE_STEP = 0.04
 #: A corner of a flat surface has three neighbours on it, a one-pixel ramp along an edge has two.
 FEWEST_NEIGHBOURS = 3
-#: Upper bound on the points of a mesh; a finer depth map is thinned.
-MESH_POINTS = 300_000
+#: Upper bounds on the points of a mesh, and of a cloud as GLB; larger ones are thinned.
+MESH_POINTS, GLB_POINTS = 300_000, 2_000_000
 PYRAMID_SHARE = 0.08  # of the cloud's median depth
 CAMERA_COLOURS = ((255, 255, 255), (255, 170, 0), (0, 200, 255), (160, 255, 120))
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
@@ -109,30 +110,35 @@ def make_mesh(
 ) -> Trimesh:
     """The surface through the points of ``make_cloud``, arguments as there, textured with the image.
 
-    It has at most ``MESH_POINTS`` points, and no triangle across a step in depth, as of ``flying_points``.
+    It has at most ``MESH_POINTS`` points, and no triangle where depth steps by more than ``RELATIVE_STEP``.
     """
     from trimesh import Trimesh
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    depth_m, sides = np.asarray(depth_m, np.float64), depth_m.shape
+    depth_m, sides = np.asarray(depth_m, np.float32), depth_m.shape
     stride = max(1, math.ceil(math.sqrt(depth_m.size / MESH_POINTS)))
-    rows, columns = (np.arange(stride // 2, side, stride) for side in sides)
-    z = np.where(_usable(depth_m, valid), depth_m, np.nan)[np.ix_(rows, columns)]
+    rows, columns = (np.arange(0, side, stride) for side in sides)
+    z = np.where(_usable(depth_m, valid), depth_m, np.nan)
+    cut = np.zeros(sides, np.uint8)  # what lies below and to the right of a pixel, up to the next point
+    for axis in (0, 1):
+        there = np.pad(z, ((0, 1 - axis), (0, axis)), mode="edge")[1 - axis :, axis:]
+        steps = ~(np.abs(there - z) <= RELATIVE_STEP * np.minimum(there, z))  # or unknown
+        window = np.ones((stride + axis, stride + 1 - axis), np.uint8)
+        cut |= cv2.dilate(steps.astype(np.uint8), window, anchor=(0, 0))
+    z, cut = (each[np.ix_(rows, columns)] for each in (z, cut))
     u, v = np.meshgrid(columns, rows)
     points = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(check_intrinsics(K)).T * z[..., None]
     index = np.arange(z.size).reshape(z.shape)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
-    faces = np.stack([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3)
-    corners = z.flatten()[faces]
-    nearest = corners.min(1)  # NaN, and so no triangle, where a depth is unknown
-    whole = corners.max(1) - nearest <= stride * RELATIVE_STEP * nearest
+    whole = cut[:-1, :-1] == 0
+    faces = np.concatenate([np.stack(part, -1)[whole] for part in ((a, c, b), (b, c, d))])
     uv = np.stack([(u + 0.5) / sides[1], 1.0 - (v + 0.5) / sides[0]], -1)
     texture = Image.fromarray(np.rint(np.clip(image_01, 0.0, 1.0) * 255.0).astype(np.uint8))
-    texture.format = "JPEG"  # how the file will hold it
-    material = PBRMaterial(baseColorTexture=texture, metallicFactor=0.0, roughnessFactor=1.0)
+    texture.format = "JPEG"  # makes trimesh store it as one
+    material = PBRMaterial(baseColorTexture=texture, metallicFactor=0.0, doubleSided=True)
     visual = TextureVisuals(uv=uv.reshape(-1, 2), material=material)
-    mesh = Trimesh(points.reshape(-1, 3), faces[whole], visual=visual, process=False)
+    mesh = Trimesh(points.reshape(-1, 3), faces, visual=visual, process=False)
     mesh.remove_unreferenced_vertices()
     return mesh
 
@@ -194,17 +200,15 @@ def write_glb(
     """Write a cloud or a mesh, which may be empty, and its cameras as GLB, whole or not at all.
 
     ``cameras`` has ``(K, E, (width, height))`` of those to draw, E the pose in the left camera's frame. In
-    glTF's axes, in metres, a point 1 m to the right of, above and before the camera is (1, 1, -1). Raises
-    ``ValueError`` if there is neither a point nor a camera.
+    glTF's axes, in metres, a point 1 m right of, above and before the camera is (1, 1, -1). ``ValueError``
+    without a point and a camera.
     """
     import trimesh
 
-    # Not a copy of the mesh: that would lose the texture's format.
-    geometry: trimesh.PointCloud | Trimesh = (
-        trimesh.PointCloud(shape.points_m, colors=shape.colours)
-        if isinstance(shape, Cloud)
-        else trimesh.Trimesh(shape.vertices, shape.faces, visual=shape.visual, process=False)
-    )
+    if isinstance(shape, Cloud):
+        geometry: Any = trimesh.PointCloud(*vars(shape.thinned(GLB_POINTS)).values())
+    else:  # of its parts, because a mesh's own copy forgets that the texture is a JPEG
+        geometry = trimesh.Trimesh(shape.vertices, shape.faces, visual=shape.visual, process=False)
     scene, length_m = trimesh.Scene(), 1.0
     if len(geometry.vertices):
         length_m = PYRAMID_SHARE * float(np.median(geometry.vertices[:, 2]))
@@ -217,7 +221,7 @@ def write_glb(
         geometry.apply_transform(OPENGL_FROM_OPENCV)
 
     def unlit(tree: dict[str, Any]) -> None:
-        """A photograph has its light already."""
+        """Shown without lights: a photograph already has its shading."""
         for material in tree["materials"]:
             material["extensions"] = {"KHR_materials_unlit": {}}
         tree["extensionsUsed"] = ["KHR_materials_unlit"]

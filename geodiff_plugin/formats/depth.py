@@ -192,12 +192,13 @@ def read_ply_points(path: Path, name: str = "points") -> np.ndarray:
 
     count = re.search(rb"\nelement vertex (\d+)\s", path.read_bytes())
     try:
-        cloud: Any = trimesh.load(path, file_type="ply", process=False)
+        how: dict[str, Any] = {"process": False, "skip_materials": True, "fix_texture": False}
+        cloud: Any = trimesh.load(path, file_type="ply", **how)
         points = np.array(cloud.vertices, np.float64)
     except Exception:  # of any kind that a damaged file leads to
         points = np.empty((0, 3))
     if count is None or not 0 < int(count.group(1)) == len(points):
-        expected = "a PLY file with vertices of x, y and z, all that it counts"
+        expected = "a whole PLY file whose vertices have x, y and z"
         bad_value(name, expected, path, "Is it cut off, or another format?")
     return points
 

@@ -20,7 +20,7 @@ from geodiff_plugin.scale.space import SPACES
 
 #: Cost beyond which a pixel is an outlier: occluded, a reflection, or wrong in the prior.
 COST_CLAMP = 0.35
-#: Pixels of the search; groups of like value in which they are looked up.
+#: Pixels of the search; number of groups of similar value that stand for them, at most.
 SAMPLES, GROUPS = 6000, 512
 #: Values of near, and of far, in the coarse grid, and in each of the two finer ones.
 COARSE_GRID, FINE_GRID = 48, 13
@@ -44,7 +44,7 @@ class ScaleSearch(NamedTuple):
 
 
 class Groups(NamedTuple):
-    """Pixels of a map in ``K`` groups of like value, summed: a candidate then costs ``K`` lookups."""
+    """Pixels of a map, sorted by value, in ``K`` groups: a candidate is then tested by ``K`` lookups."""
 
     x: Tensor  # (K,) mean value
     size: Tensor  # (K,) number of pixels
@@ -53,13 +53,11 @@ class Groups(NamedTuple):
 
 
 def group_pixels(x: Tensor, cost: Tensor, in_view: Tensor) -> Groups:
-    """Values ``x (P,)``, with their ``cost`` and ``in_view (D, P)``, in ``GROUPS`` of one size, or fewer."""
-    order, count = x.argsort(), min(GROUPS, len(x))
-    group = torch.arange(len(x), device=x.device) * count // len(x)
+    """Values ``x (P,)``, with their ``cost`` and ``in_view (D, P)``, in groups of one size."""
+    order, each = x.argsort(), -(-len(x) // GROUPS)
 
     def summed(values: Tensor) -> Tensor:
-        total = values.new_zeros(*values.shape[:-1], count)
-        return total.index_add_(-1, group, values[..., order])
+        return F.pad(values[..., order], (0, -len(x) % each)).unflatten(-1, (-1, each)).sum(-1)
 
     seen, size = in_view.to(cost), summed(torch.ones_like(x))
     return Groups(summed(x) / size, size, summed(seen), summed(cost.clamp_max(COST_CLAMP) * seen))

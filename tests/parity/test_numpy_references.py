@@ -83,10 +83,11 @@ def test_a_candidate_costs_the_mean_of_what_is_in_view():
     cost, in_view = made.at_pixels(at)
     planes, x = made.inverse_depth.numpy(), _random(len(at), seed=1)
     groups = group_pixels(torch.from_numpy(x).float(), cost, in_view)
-    assert len(at) > len(groups.x) == 512
-    depth = 1.5 + 12 * _random(4, 512)
+    each = -(-len(at) // 512)
+    parts = np.split(np.argsort(x), range(each, len(at), each))
+    assert each > 1 and len(parts) == len(groups.x)
+    depth = 1.5 + 12 * _random(4, len(parts))
     found, share = _lookup(groups, made.inverse_depth, torch.from_numpy(depth).float())
-    parts = [np.argsort(x)[np.arange(len(at)) * 512 // len(at) == k] for k in range(512)]
     np.testing.assert_allclose(groups.x, [x[part].mean() for part in parts], rtol=1e-5)
     for row, mean, seen in zip(depth, found, share, strict=True):
         total, count = 0.0, 0.0

@@ -96,7 +96,7 @@ def test_fields_become_options_and_those_of_another_way_are_left_out(photographs
 def test_what_a_visitor_left_out_or_gave_wrongly(photographs, monkeypatch):
     for left, way, said in (
         (photographs[0], "numbers", "fx and baseline must be given"),
-        (photographs[0], "photographs", "the distance of the cameras must be given"),
+        (photographs[0], "photographs", "the distance of the cameras, or a known length, must be given"),
         (photographs[0], "file", "calibration must be a calibration file"),
         (None, "file", "the left photograph must be given"),
         (__file__, "file", "the left photograph must be an image file"),

@@ -63,7 +63,7 @@ def test_ply_in_binary_and_in_text(tmp_path, order):
     (tmp_path / "points.ply").write_bytes(head.encode() + rows.tobytes() + b"\x03" + bytes(12))
     np.testing.assert_allclose(read_points(tmp_path / "points.ply"), POINTS, rtol=1e-6)
     (tmp_path / "points.ply").write_bytes(head.encode() + rows.tobytes()[:-1])
-    with pytest.raises(ValueError, match="points must be a PLY file with vertices.*cut off"):
+    with pytest.raises(ValueError, match="points must be a whole PLY file.*cut off"):
         read_points(tmp_path / "points.ply")
     head = PLY.format(kind="ascii", properties=PROPERTIES, more="")
     (tmp_path / "points.ply").write_text(head + "0.1 255 -0.2 2.0\n0.4 0 0.3 5.5\n")
