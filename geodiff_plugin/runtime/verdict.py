@@ -310,7 +310,7 @@ def _reasons(run: Indicators) -> list[str]:
         reasons.append(
             f"The scale of the refined pose is uncertain by {100 * min(run.scale_spread, 1):.0f} %: the "
             "baseline and the depth of the scene under the given pose disagree. Give the measured distance "
-            "of the cameras (--baseline, measured_baseline=True), or known points."
+            f"of the cameras (--baseline, measured_baseline=True), or {LEAST_POINTS} known points or more."
         )
     if run.off_matches > OFF_MATCHES and run.points < LEAST_POINTS:
         reasons.append(

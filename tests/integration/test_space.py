@@ -2,6 +2,7 @@
 
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,8 @@ def test_card_has_what_a_space_needs():
     pinned = next(line for line in lines if line.startswith("gradio=="))
     assert pinned == f"gradio=={card['sdk_version']}"
     assert len(card["short_description"]) <= 60
+    project = tomllib.loads((SPACE.parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert set(project["dependencies"]) <= set((SPACE / "requirements.txt").read_text().splitlines())
 
 
 @pytest.mark.filterwarnings("ignore")  # the client's own

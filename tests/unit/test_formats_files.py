@@ -185,13 +185,10 @@ def test_a_mesh_wears_the_image_and_stops_at_steps_and_unknown_depths(tmp_path):
     depth_m[:5, :5] = np.nan
     image = np.mgrid[0:48, 0:64].transpose(1, 2, 0)[..., [0, 1, 1]] / 64
     mesh = make_mesh(depth_m, image, K_60)
-    assert set(np.unique(mesh.vertices[mesh.faces][..., 2])) == {2.0, 4.0}
     assert np.ptp(mesh.vertices[mesh.faces][..., 2], axis=1).max() == 0
-    assert len(mesh.faces) == 2 * 47 * (39 + 23) - 50
-    assert np.allclose(mesh.vertex_normals, [0, 0, -1])  # towards the camera
+    assert len(mesh.faces) == 2 * 47 * (39 + 23) - 50 and np.allclose(mesh.vertex_normals, [0, 0, -1])
     fine = make_mesh(np.where(np.arange(900) < 500, 2.0, 2.2) * np.ones((800, 1)), np.zeros((800, 900, 3)), K)
-    z = fine.vertices[:, 2][fine.faces]
-    assert len(z) > 200_000 and np.ptp(z, axis=1).max() == 0  # no bridge between points that are left out
+    assert len(fine.faces) > 200_000 and np.ptp(fine.vertices[:, 2][fine.faces], axis=1).max() == 0
     write_glb(tmp_path / "a.glb", mesh, [LEFT])
     scene, data = parse_glb(tmp_path / "a.glb")
     surface, at = scene["meshes"][0]["primitives"][0], scene["bufferViews"][scene["images"][0]["bufferView"]]
