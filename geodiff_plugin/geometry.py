@@ -152,8 +152,8 @@ def plane_rays(
     x, y, _ = _rays(size, K_left).flatten(1, 2)[:, None].unbind(-1)  # (B, 1, H * W) each, at z = 1
     M = K_right @ T_right_from_left[:, :3, :3]
     # Not a matrix product, which TF32 rounds by a quarter pixel.
-    A, b = M[..., 2:] + M[..., 1:2] * y + M[..., :1] * x, K_right @ T_right_from_left[:, :3, 3:]
-    return PlaneRays(A, b)
+    A = M[..., 2:] + M[..., 1:2] * y + M[..., :1] * x
+    return PlaneRays(A, K_right @ T_right_from_left[:, :3, 3:])
 
 
 def project_rays(depth_m: Tensor, rays: PlaneRays) -> tuple[Tensor, Tensor]:

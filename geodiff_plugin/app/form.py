@@ -15,6 +15,8 @@ from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.options import PRESETS, help_of
 
 PICTURE_HEIGHT = 190
+#: Of handlers that only the page itself calls.
+QUICK: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
 #: Labels of the fields that hold a number or nothing.
 NUMBERS = {
     "fx": "fx, px",
@@ -132,10 +134,9 @@ def _views() -> dict[str, Any]:
         first = ENDS.findall(before or "")
         return ", ".join([*(first if len(first) == 2 else []), *map(str, event.index)])
 
-    quick: dict[str, Any] = {"queue": False, "api_visibility": "private"}
-    way.change(show, way, [calibration, lens, cx_right, length], **quick)
-    drawn["left"].select(tap, ends, ends, show_progress="hidden", **quick)
-    gr.on([drawn["left"].upload, drawn["left"].clear], lambda: "", outputs=ends, **quick)
+    way.change(show, way, [calibration, lens, cx_right, length], **QUICK)
+    drawn["left"].select(tap, ends, ends, **QUICK)
+    gr.on([drawn["left"].upload, drawn["left"].clear], lambda: "", outputs=ends, **QUICK)
     return drawn
 
 

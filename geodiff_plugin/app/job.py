@@ -29,6 +29,7 @@ CAMERA_WAYS = {
     "numbers": "Focal length and baseline",
     "photographs": "Estimate from the photographs",
 }
+#: A coordinate of an end of the known length.
 ENDS = re.compile(r"-?\d+(?:\.\d+)?")
 #: A photograph of more is not decoded.
 MOST_MEGAPIXELS = 50
@@ -91,8 +92,8 @@ def options_of(
         cure = "Photographs have no unit: measure the distance of the cameras, or a length in the left one."
         got = "nothing" if baseline is None else "both"
         bad_value("the distance of the cameras, or a known length,", "given", got, cure)
-    numbers = ENDS.findall(ends or "")
     if way == "photographs" and known_length is not None:
+        numbers = ENDS.findall(ends or "")
         if len(numbers) != 4:
             cure = "Tap both on the left photograph, or type x1, y1, x2, y2."
             bad_value("the ends of the known length", "two pixels", repr(ends or ""), cure)

@@ -20,7 +20,7 @@ import numpy as np
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.app import look
-from geodiff_plugin.app.form import EXAMPLES, Form, build_form
+from geodiff_plugin.app.form import EXAMPLES, QUICK, Form, build_form
 from geodiff_plugin.app.job import Priors, Stopped, run_job
 from geodiff_plugin.app.results import (
     NAMES,
@@ -66,10 +66,6 @@ THEME = gr.themes.Base(
     block_label_text_color="#334155",
     block_label_text_color_dark="#cbd5e1",
 )
-
-
-#: Handlers that only the page itself calls.
-QUICK: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
 
 
 def _forget(job: Job | None) -> None:

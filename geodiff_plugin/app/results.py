@@ -16,8 +16,8 @@ from PIL import Image, ImageDraw, ImageFont
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.app import look
 from geodiff_plugin.cli.depth import Job
-from geodiff_plugin.cli.outputs import cameras_of, single_map, surface_of
-from geodiff_plugin.formats import write_glb
+from geodiff_plugin.cli.outputs import cameras_of, pixels_of, single_map
+from geodiff_plugin.formats import make_cloud, write_glb
 from geodiff_plugin.formats.out import REPORT
 from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, ticks
 
@@ -255,7 +255,7 @@ def _write_readings(path: Path, readings: Sequence[Reading]) -> None:
 
 def write_scene(path: Path, job: Job, least_confidence: float) -> int:
     """Cloud and cameras as GLB, light enough for a browser; how many points there are in all."""
-    cloud = surface_of(job.output, job.inputs.left, least_confidence)
+    cloud = make_cloud(*pixels_of(job.output, job.inputs.left, least_confidence))
     write_glb(path, cloud.thinned(MOST_POINTS_SHOWN), cameras_of(job.output, job.inputs.guidance))
     return len(cloud.points_m)
 

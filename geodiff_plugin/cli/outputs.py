@@ -240,30 +240,32 @@ def cameras_of(
     return ((K, np.eye(4), (depth_m.shape[1], depth_m.shape[0])), *rights)
 
 
-def surface_of(
-    output: MetricDepthOutput, left: np.ndarray, least_confidence: float, make: Any = make_cloud
-) -> Any:
-    """A cloud, or by ``make_mesh`` a mesh, of the pixels of at least this confidence that do not fly."""
+def pixels_of(
+    output: MetricDepthOutput, left: np.ndarray, least_confidence: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What ``make_cloud`` and ``make_mesh`` take: pixels of at least this confidence that do not fly."""
     depth_m = single_map(output.prediction)
     keep = ~flying_points(depth_m)
     if output.confidence is not None:
         keep &= single_map(output.confidence) >= least_confidence
-    return make(depth_m, left, np.asarray(output.K)[0].astype(np.float64), keep)
+    return depth_m, left, np.asarray(output.K)[0].astype(np.float64), keep
 
 
 def write_exports(folder: Path, output: MetricDepthOutput, inputs: Inputs, options: DepthOptions) -> None:
     """Write what ``--export`` asks for, and images of a COLMAP model that were undistorted."""
-    shown, cameras = (output, inputs.left, options.min_confidence), cameras_of(output, inputs.guidance)
-    for name, file, make in (("glb", "cloud.glb", make_cloud), ("mesh", "mesh.glb", make_mesh)):
-        if name in options.export:
-            write_glb(folder / file, surface_of(*shown, make), cameras)
+    pixels = pixels_of(output, inputs.left, options.min_confidence)
+    cameras = cameras_of(output, inputs.guidance)
+    if "glb" in options.export:
+        write_glb(folder / "cloud.glb", make_cloud(*pixels), cameras)
+    if "mesh" in options.export:
+        write_glb(folder / "mesh.glb", make_mesh(*pixels), cameras)
     if "colmap" in options.export:
         names = told_apart(options.photographs().values())
         if inputs.undistorted:
             views = [inputs.left, *(image.permute(1, 2, 0).numpy() for image in inputs.guidance.rights)]
             names = [write_undistorted(folder, image, number) for number, image in enumerate(views, 1)]
         named = [(name, *view) for name, view in zip(names, cameras, strict=True)]
-        write_colmap(folder, named, surface_of(*shown))
+        write_colmap(folder, named, make_cloud(*pixels))
 
 
 def _map(path: Path) -> np.ndarray:

@@ -206,13 +206,15 @@ def write_glb(
     import trimesh
 
     if isinstance(shape, Cloud):
-        geometry: Any = trimesh.PointCloud(*vars(shape.thinned(GLB_POINTS)).values())
+        name, cloud = "cloud", shape.thinned(GLB_POINTS)
+        geometry: Any = trimesh.PointCloud(cloud.points_m, colors=cloud.colours)
     else:  # of its parts, because a mesh's own copy forgets that the texture is a JPEG
+        name = "mesh"
         geometry = trimesh.Trimesh(shape.vertices, shape.faces, visual=shape.visual, process=False)
     scene, length_m = trimesh.Scene(), 1.0
     if len(geometry.vertices):
         length_m = PYRAMID_SHARE * float(np.median(geometry.vertices[:, 2]))
-        scene.add_geometry(geometry, geom_name="cloud" if isinstance(shape, Cloud) else "mesh")
+        scene.add_geometry(geometry, geom_name=name)
     for number, (K, E, size) in enumerate(cameras):
         lines = trimesh.load_path(_pyramid(np.asarray(K), np.asarray(E), size, length_m)[EDGES])
         lines.colors = np.tile(CAMERA_COLOURS[number % len(CAMERA_COLOURS)], (len(lines.entities), 1))
