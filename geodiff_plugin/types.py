@@ -118,7 +118,7 @@ class MetricDepthOutput(BaseOutput):
         scale: ``(N, E)`` softplus of the learnt scale.
         shift: ``(N, E)`` softplus of the learnt shift.
         global_scale: ``(N, E)`` metres, the pre-selected g_s of Eq. 16.
-        own_scale: ``(N, E)`` median factor from a metric prior's metres to the result, else ``None``.
+        prior_scale: ``(N, E)`` median factor from a metric prior's metres to the result, else ``None``.
         visible: boolean, in front of a right camera and inside its image; ``None`` without a right view.
         photometric_error: [0, 1] mean absolute difference between the left image and the warped right view
             that matches the pixel best; 0 where not visible; ``None`` without a right view.
@@ -150,7 +150,7 @@ class MetricDepthOutput(BaseOutput):
     scale: torch.Tensor | None = None
     shift: torch.Tensor | None = None
     global_scale: torch.Tensor | None = None
-    own_scale: torch.Tensor | None = None
+    prior_scale: torch.Tensor | None = None
     visible: np.ndarray | torch.Tensor | None = None
     photometric_error: np.ndarray | torch.Tensor | None = None
     confidence: np.ndarray | torch.Tensor | None = None

@@ -289,18 +289,18 @@ def choose_neighbours(
 
 def _values(solved: SolvedCapture, frame: int) -> np.ndarray:
     """``(N, P)`` worth of the frame's points to every other frame, 0 where it does not see them."""
-    own, values = solved.seen[frame].point, np.zeros((len(solved.E), len(solved.seen[frame].point)))
-    rays = solved.points[own] - solved.E[frame, :3, 3]
+    points, values = solved.seen[frame].point, np.zeros((len(solved.E), len(solved.seen[frame].point)))
+    rays = solved.points[points] - solved.E[frame, :3, 3]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     for other, (E, seen) in enumerate(zip(solved.E, solved.seen, strict=True)):
         if other == frame or not np.isfinite(E).all():
             continue
-        back = solved.points[own] - E[:3, 3]
+        back = solved.points[points] - E[:3, 3]
         back /= np.linalg.norm(back, axis=1, keepdims=True)
         angle = np.degrees(np.arccos(np.clip((rays * back).sum(1), -1, 1)))
         width = np.where(angle < BEST_ANGLE_DEG, NARROWER_DEG, WIDER_DEG)
         worth = np.exp(-0.5 * ((angle - BEST_ANGLE_DEG) / width) ** 2)
-        values[other] = worth * np.isin(own, seen.point)
+        values[other] = worth * np.isin(points, seen.point)
     return values
 
 

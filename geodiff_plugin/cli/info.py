@@ -11,14 +11,14 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.bundled import no_bars
 from geodiff_plugin.cli.terminal import print_lines
 from geodiff_plugin.config import knob_lines
-from geodiff_plugin.priors import PRIORS, FoundPrior, find_prior, prior_of
+from geodiff_plugin.priors import PRIORS, PriorSource, find_prior, prior_of
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runtime.machine import versions
 
 
-def _describe(found: FoundPrior, space: str | None) -> list[tuple[str, str]]:
-    """What the adapter of a prior found, once its weights are read."""
-    pipe = found.load(space=space)
+def _describe(source: PriorSource, space: str | None) -> list[tuple[str, str]]:
+    """What the adapter of a prior says, once its weights are read."""
+    pipe = source.load(space=space)
     adapter = prior_of(pipe)
     parts = [part for part in pipe.components.values() if isinstance(part, torch.nn.Module)]
     parameters = sum(weight.numel() for part in parts for weight in part.parameters())
@@ -26,9 +26,9 @@ def _describe(found: FoundPrior, space: str | None) -> list[tuple[str, str]]:
     options = pipe.call_options() if isinstance(pipe, DepthDiffusionPipeline) else []
     side = pipe.image_processor.config.vae_scale_factor
     return [
-        ("prior", found.layout.name),
-        ("adapter", found.key),
-        ("licence", found.licence),
+        ("prior", source.layout.name),
+        ("adapter", source.key),
+        ("licence", source.licence),
         ("pipeline", type(pipe).__name__),
         ("scheduler", type(pipe.scheduler).__name__),
         ("parameters", f"{parameters / 1e6:.1f} M"),

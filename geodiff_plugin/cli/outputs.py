@@ -119,10 +119,10 @@ def build_report(
         error = float(single_map(output.photometric_error)[visible].mean()) if visible.any() else math.nan
     verdict, spread, estimated = asdict(output.verdict), output.uncertainty, guidance.estimated
     if estimated is not None:
-        found = ("inliers", "parallax_deg", "residual_px", "depth_spread")
+        measures = ("inliers", "parallax_deg", "residual_px", "depth_spread")
         scale = {"scale_from": output.scale_from, "scale_spread": output.scale_spread}
-        pose = {name: getattr(estimated, name) for name in found} | scale | {"assumed": estimated.notes}
-    names = ("K", "scale", "shift", "global_scale", "own_scale", "prior_error", "unit", "assumed")
+        pose = {name: getattr(estimated, name) for name in measures} | scale | {"assumed": estimated.notes}
+    names = ("K", "scale", "shift", "global_scale", "prior_scale", "prior_error", "unit", "assumed")
     expected_m = expected_error(depth_m, guidance.inputs[0].K_left, used_poses(output, guidance))
     report = {
         "depth": depth_summary(depth_m, visible),
@@ -182,13 +182,13 @@ def summary_line(report: dict[str, Any], where: str) -> str:
     if verdict["status"] != "trusted":
         reason = verdict["reasons"][0] if verdict["reasons"] else "neither matches nor known depths test it."
         return f"{verdict['status'].upper()}: {reason} (Unconfirmed: {metres}; {end})"
-    signs, error, own = verdict["signs"], report.get("expected_error_median_m"), report["own_scale"]
+    signs, error, over_prior = verdict["signs"], report.get("expected_error_median_m"), report["prior_scale"]
     trusted = ["trusted"]
     trusted += [] if signs["confidence"] is None else [f"confidence {signs['confidence']:.2f}"]
     trusted += [] if error is None else [f"expected error {_length(error, report['unit'])}"]
     trusted += [] if signs["matched"] is None else [f"{100 * signs['matched']:.0f} % matched"]
     trusted += [f"{signs['points']} known depths"] if signs["points"] else []
-    scale = [] if own is None else [f"prior's own metres x {own[0][0]:.2f}"]
+    scale = [] if over_prior is None else [f"prior's own metres x {over_prior[0][0]:.2f}"]
     return "; ".join([metres, ", ".join(trusted), *scale, end])
 
 

@@ -109,10 +109,10 @@ def _of_folders(left: Path, right: Path | None) -> tuple[list[PairRef], str]:
         got = "nothing" if right is None else right
         bad_value("RIGHT", "a folder where LEFT is one", got, "Or let LEFT be an image, or a list of pairs.")
     lefts, rights = _photographs(left), _photographs(right)
-    for name, folder, found in (("LEFT", left, lefts), ("RIGHT", right, rights)):
-        if not found:
+    for name, folder, paths in (("LEFT", left, lefts), ("RIGHT", right, rights)):
+        if not paths:
             bad_value(name, "a folder of images", f"{folder}, which holds none that Pillow knows")
-        twice = [stem for stem, count in Counter(path.stem for path in found).items() if count > 1]
+        twice = [stem for stem, count in Counter(path.stem for path in paths).items() if count > 1]
         if twice:
             cure = "Keep one of them, or write a list of pairs."
             bad_value(name, "a folder of images with different names", f"two {twice[0]} in {folder}", cure)

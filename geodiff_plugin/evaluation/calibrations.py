@@ -44,21 +44,21 @@ def poses_table(title: str, columns: Mapping[str, Sequence[Record]], note: str) 
 
     # Changed samples, in the same order, have other names.
     names = [{"dataset": r["dataset"], "sample": r["sample"]} for r in next(iter(columns.values()))]
-    own = [[r | like for r, like in zip(records, names, strict=True)] for records in columns.values()]
-    table = tables.per_pair_table(title, zip(columns, own, strict=True), headline, 3, note, mean)
-    missing = (str(sum(headline(record) is None for record in records)) for records in own)
-    unwarned = (str(sum(map(silently_off, records))) for records in own)
+    shown = [[r | like for r, like in zip(records, names, strict=True)] for records in columns.values()]
+    table = tables.per_pair_table(title, zip(columns, shown, strict=True), headline, 3, note, mean)
+    missing = (str(sum(headline(record) is None for record in records)) for records in shown)
+    unwarned = (str(sum(map(silently_off, records))) for records in shown)
     more = ("without a result", *missing), (f"off by more than {BY_A_FACTOR:g}, no warning", *unwarned)
     return replace(table, rows=(*table.rows, *more))
 
 
-def _residual(name: str, own: Sequence[Record]) -> str:
+def _residual(name: str, group: Sequence[Record]) -> str:
     """One number a right view, a dash for none."""
-    return " / ".join(f"{px:.2f}" for px in tables.value_at(own[0], f"notes.method.{name}") or []) or "-"
+    return " / ".join(f"{px:.2f}" for px in tables.value_at(group[0], f"notes.method.{name}") or []) or "-"
 
 
 _RESIDUALS: dict[str, CellOf] = {
-    "pair": lambda own: label_of(own[0]),
+    "pair": lambda group: label_of(group[0]),
     "refined, as given": partial(_residual, "residual_px_given"),
     "refined, as used": partial(_residual, "residual_px"),
 }
@@ -99,8 +99,8 @@ def run_poses(name: str, options: PosesOptions) -> Page | None:
 
     def page_tables(records: list[Record]) -> list[Table]:
         shown = []
-        for title, own in tables.grouped(records, "table").items():
-            columns = tables.grouped(own, "column")
+        for title, group in tables.grouped(records, "table").items():
+            columns = tables.grouped(group, "column")
             shown.append(poses_table(title, columns, notes[title]))
             if title.endswith("two views"):
                 of_pairs = (columns["refined"], ("key",), _RESIDUALS, RESIDUAL_NOTE)
@@ -217,20 +217,20 @@ def _measure(ref: SampleRef, other: SampleRef, kind: str, read: Any, pipe: Any, 
     return head | {"status": verdict.status, "said": said, "off": off, "signs": signs}
 
 
-def _share(own: Sequence[Record], *, told: bool = True, off: bool = False) -> str:
+def _share(group: Sequence[Record], *, told: bool = True, off: bool = False) -> str:
     """Of records, or of those whose depth is off, how many were told, or else not trusted."""
-    counted = [record for record in own if not off or record["off"] is None or record["off"] > OFF]
+    counted = [record for record in group if not off or record["off"] is None or record["off"] > OFF]
     part = sum(record["status"] != "trusted" or (told and bool(record["said"])) for record in counted)
     return f"{part} of {len(counted)} ({100 * part // len(counted)} %)" if counted else "-"
 
 
-def _median(own: Sequence[Record]) -> str:
-    known = [record["off"] for record in own if record["off"] is not None]
+def _median(group: Sequence[Record]) -> str:
+    known = [record["off"] for record in group if record["off"] is not None]
     return f"{np.median(known):.2f}" if known else "-"
 
 
 _COLUMNS: dict[str, CellOf] = {
-    "given as": lambda own: KINDS[own[0]["kind"]][0],
+    "given as": lambda group: KINDS[group[0]["kind"]][0],
     "median error": _median,
     "not trusted": partial(_share, told=False),
     "anything said": _share,
@@ -238,16 +238,16 @@ _COLUMNS: dict[str, CellOf] = {
 }
 
 
-def _table(group: str, records: Sequence[Record]) -> Table:
+def _table(source: str, records: Sequence[Record]) -> Table:
     """A row a kind, then all wrong ones, with and without those that two views cannot show."""
-    pairs = count_of_pairs(len({record["sample"] for record in records}), f"{group} ")
+    pairs = count_of_pairs(len({record["sample"] for record in records}), f"{source} ")
     title = f"Wrong calibrations detected, right ones not trusted: {pairs}"
     table = tables.table_of_groups(title, records, ("kind",), _COLUMNS, TRUST_NOTE)
     wrong = [record for record in records if record["kind"] in WRONG]
     # Rectified rows stay rows under any focal length.
     seen = [record for record in wrong if not (record["rectified"] and record["kind"].startswith("K-"))]
     sums = {"all wrong ones": wrong, "without focal lengths of rectified pairs": seen}
-    more = ((name, "", "", "", _share(own, off=True)) for name, own in sums.items())
+    more = ((name, "", "", "", _share(group, off=True)) for name, group in sums.items())
     return replace(table, rows=(*table.rows, *more))
 
 
@@ -264,19 +264,19 @@ def run_trust(name: str, options: TrustOptions) -> Page | None:
     configuration = guided_configuration(GeometryGuidance, settings)
     pipe, prior = priors.get(settings), f"{settings.prior} {priors.fingerprint(settings)}"
     cells = []
-    for group, refs in zip(("real", "rendered"), pairs, strict=True):
+    for source, refs in zip(("real", "rendered"), pairs, strict=True):
         for ref, following in zip(refs, (*refs[1:], *refs[:1]), strict=True):
             for kind in (*right, *wrong):
                 unrelated = kind == "unrelated"
                 if unrelated and len(refs) == 1:
                     continue
                 beside = {"other": experiment.cell_key(following, "", {})} if unrelated else {}
-                head = {"kind": kind, "group": group, "sample": ref.label}
+                head = {"kind": kind, "group": source, "sample": ref.label}
                 work = partial(_measure, ref, following if unrelated else ref, kind, read, pipe, settings)
                 key = experiment.cell_key(ref, kind, configuration | beside, prior)
                 cells.append(Item(key, work, name=f"{ref.label}, {kind}", head=head))
 
     def page_tables(records: list[Record]) -> list[Table]:
-        return [_table(group, own) for group, own in tables.grouped(records, "group").items()]
+        return [_table(source, group) for source, group in tables.grouped(records, "group").items()]
 
     return run_experiment(name, options, "Trust", cells, page_tables)

@@ -311,7 +311,7 @@ def method_cells(
         settings = replace(settings, device=f"cuda:{process.local % torch.cuda.device_count()}")
     cells = []
     for ref, method in product(refs, map(find_method, methods)):
-        chosen = method.own_settings(settings)
+        chosen = method.adapted(settings)
         prior = f"{chosen.prior} {priors.fingerprint(chosen)}" if method.uses_prior else ""
         device = chosen.device.partition(":")[0] if several else chosen.device
         configuration = method.configuration(replace(chosen, device=device))

@@ -94,7 +94,7 @@ def _curves(
     """A line for each method through the means of its groups of records, a band where all have intervals."""
     drawn: dict[str, list[float | None]] = {}
     for index, (name, of_method) in enumerate(groups.items()):
-        done = [[value_of(record) for record in own if record["status"] == "ok"] for own in of_method]
+        done = [[value_of(record) for record in group if record["status"] == "ok"] for group in of_method]
         means, marks = list(map(mean_with_interval, done)), _style(index)
         axes.plot(x, [mean.value for mean in means], label=find_method(name).title, **marks)
         if all(mean.low is not None for mean in means):
@@ -266,7 +266,7 @@ def _answer(
     """Title, depth ``(H, W)`` and AbsRel of a method; an empty map without AbsRel where it cannot work."""
     method = find_method(name)
     try:
-        prediction = method.run(sample, method.own_settings(settings), priors)
+        prediction = method.run(sample, method.adapted(settings), priors)
     except NotApplicable as reason:
         return f"{method.title}: {reason}", np.full(sample.depth_m.shape, np.nan), None
     depth_m = in_metres(prediction, sample.depth_m, sample.valid)

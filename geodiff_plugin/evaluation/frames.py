@@ -107,7 +107,7 @@ def _measure_sequence(pipe: Any, render: Any, seed: int, way: str, options: Sequ
 
 
 _SEQUENCE_COLUMNS: dict[str, CellOf] = {
-    "frames": lambda own: WAYS[own[0]["way"]],
+    "frames": lambda group: WAYS[group[0]["way"]],
     "AbsRel": mean_of("abs_rel", 4),
     "worst frame": most_of("worst"),
     "flicker %": mean_of("flicker", 2, 100.0),
@@ -127,8 +127,8 @@ def sequence_tables(records: Sequence[Record]) -> list[Table]:
 
 
 _CAPTURE_COLUMNS: dict[str, CellOf] = {
-    "poses": lambda own: str(own[0]["row"]),
-    "views": lambda own: str(own[0]["views"]),
+    "poses": lambda group: str(group[0]["row"]),
+    "views": lambda group: str(group[0]["views"]),
     "AbsRel": mean_of("abs_rel", 4),
     "worst": mean_of("worst", 4),
     "scaled": mean_of("scaled", 4),
@@ -196,7 +196,7 @@ def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
 
     def tables(records: list[Record]) -> list[Table]:
         captures = grouped(records, "data").items()
-        return [table_of_groups(titles[data], own, ("key",), _CAPTURE_COLUMNS) for data, own in captures]
+        return [table_of_groups(titles[data], group, ("key",), _CAPTURE_COLUMNS) for data, group in captures]
 
     return run_experiment(name, options, "Captures", cells, tables, lambda _: (CAPTURE_NOTE,))
 

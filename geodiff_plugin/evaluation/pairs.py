@@ -52,15 +52,15 @@ def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
     remarks = [f"Prior {options.prior}, seed {options.seed}, ensemble {options.ensemble}."]
     by_status = tables.grouped(records, "status")
     impossible = tables.grouped(by_status.get("not applicable", ()), "method", "reason")
-    for (method, reason), own in impossible.items():
-        remarks.append(f"{find_method(method).title}: '-' for {count_of_pairs(len(own))}, {reason}.")
+    for (method, reason), group in impossible.items():
+        remarks.append(f"{find_method(method).title}: '-' for {count_of_pairs(len(group))}, {reason}.")
     broken = by_status.get("broken", ())
     if broken:
         count = len(set(map(tables.label_of, broken)))
         remarks.append(f"{count} broken {'sample was' if count == 1 else 'samples were'} skipped:")
-    for (_, _, error), own in tables.grouped(broken, "dataset", "sample", "error").items():
-        names = ", ".join(record["method"] for record in own)
-        remarks.append(f"- {tables.label_of(own[0])} ({names}): {error}")
+    for (_, _, error), group in tables.grouped(broken, "dataset", "sample", "error").items():
+        names = ", ".join(record["method"] for record in group)
+        remarks.append(f"- {tables.label_of(group[0])} ({names}): {error}")
     return remarks
 
 
@@ -192,9 +192,9 @@ STEPS = 4
 def cost_table(records: Sequence[Record]) -> Table:
     """Seconds and memory of every method, and both as multiples of the plain pipeline's."""
     costs, rows = {}, []
-    for method, own in tables.grouped((r for r in records if r["status"] == "ok"), "method").items():
-        peak = max(record["peak_bytes"] for record in own)
-        costs[method] = len(own), statistics.median(record["seconds"] for record in own), peak
+    for method, group in tables.grouped((r for r in records if r["status"] == "ok"), "method").items():
+        peak = max(record["peak_bytes"] for record in group)
+        costs[method] = len(group), statistics.median(record["seconds"] for record in group), peak
     if PLAIN not in costs:
         cure = "See geodiff eval cost without --skip-broken for the reason."
         bad_value("the pairs", f"some on which {PLAIN} works", "none", cure)

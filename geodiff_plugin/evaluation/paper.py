@@ -158,7 +158,7 @@ def layout_table(
         cells = [row.title, "✓" if row.aligned else "✗"]
         for column in columns:
             of_method = (metric.get(method, {}) for metric in values[row.aligned])
-            cells += [tables.whole_mean([own.get(x) for x in column.labels]) for own in of_method]
+            cells += [tables.whole_mean([values.get(x) for x in column.labels]) for values in of_method]
             cells += row.published.get(column.title, ["-"] * count) if column.complete else []
         rows.append(tuple(cells))
     note = "Capped at 80 m for KITTI and 10 m for Booster. † in metres as they come out."
@@ -207,8 +207,8 @@ def run_paper_table(name: str, options: PairsOptions) -> Page | None:
     columns = _ablation_columns(options) if ablation else layout.columns
     # The paper drew its posed pairs at random, and so does the table where there are enough to draw from.
     chosen = [_find(column, options, draw=posed) for column in columns]
-    refs = [ref for _, own in chosen for ref in own]
-    missing = ((c.title, DATASETS[c.datasets[0]].obtain) for c, own in chosen if not own)
+    refs = [ref for _, members in chosen for ref in members]
+    missing = ((c.title, DATASETS[c.datasets[0]].obtain) for c, members in chosen if not members)
     more = [f"{title} was not found. To obtain it: {obtain}" for title, obtain in missing]
     if not refs:
         bad_value("--data", f"a folder with the data of {name}", str(options.data), " ".join(more))
@@ -217,8 +217,8 @@ def run_paper_table(name: str, options: PairsOptions) -> Page | None:
     names = methods_of(name, options.methods)
 
     def page_tables(records: list[Record]) -> list[Table]:
-        finished = {tables.label_of(record) for record in records if record["status"] != "broken"}
-        measured = [c._replace(labels=frozenset(ref.label for ref in own) & finished) for c, own in chosen]
+        finished = frozenset(tables.label_of(r) for r in records if r["status"] != "broken")
+        measured = [c._replace(labels=finished & {r.label for r in refs}) for c, refs in chosen]
         shown = [layout_table(layout, measured, records, names)]
         shown += [changes_table(records, preset) for preset in (ABLATED if ablation else ())]
         for column in measured:

@@ -42,7 +42,7 @@ NOTE = (
 )
 
 COLUMNS: dict[str, CellOf] = {
-    "prior's error": lambda own: str(own[0]["strength"]),
+    "prior's error": lambda group: str(group[0]["strength"]),
     "method": method_title,
     "AbsRel": mean_of("abs_rel", 4),
     "δ1": mean_of("delta1", 4),
@@ -156,7 +156,7 @@ def _measure(
         bad_value("--data", f"pairs with truth on {DENSE:.0%} of their pixels or more", sample.label)
     prior.answer(sample, STRENGTHS[strength], options.resolution, options.seed)
     try:
-        prediction = method.run(sample, method.own_settings(options.settings), prior)
+        prediction = method.run(sample, method.adapted(options.settings), prior)
     except NotApplicable as reason:
         bad_value("--methods", "methods that work on every pair", f"{name}, not on {sample.label}: {reason}")
     depth_m = in_metres(prediction, *truth)
@@ -175,11 +175,11 @@ def strength_tables(records: Sequence[Record]) -> list[Table]:
         "Real": [r for r in records if not r["rendered"]],
     }
     names, page = ("strength", "method"), []
-    for title, own in groups.items():
-        if own:
+    for title, group in groups.items():
+        if group:
             # Not by label: pairs of one name in two folders are two.
-            pairs = tables.count_of_pairs(max(map(len, tables.grouped(own, *names).values())))
-            page.append(tables.table_of_groups(title, own, names, COLUMNS, f"{pairs}. {NOTE}"))
+            pairs = tables.count_of_pairs(max(map(len, tables.grouped(group, *names).values())))
+            page.append(tables.table_of_groups(title, group, names, COLUMNS, f"{pairs}. {NOTE}"))
     return page
 
 
@@ -194,7 +194,7 @@ def run_strength(name: str, options: StrengthOptions) -> Page | None:
     prior, read, cells = EmulatedPrior(options.space, options.follow), lru_cache(maxsize=1)(load), []
     for ref, strength, method_name in product(refs, options.strengths, options.methods):
         method = find_method(method_name)
-        configuration = method.configuration(method.own_settings(options.settings))
+        configuration = method.configuration(method.adapted(options.settings))
         emulated = f"emulated {options.space} {options.follow} {strength} {options.seed}"
         head = {"pair": ref.label, "strength": strength, "method": method_name}
         work = partial(_measure, prior, options, read, ref, strength, method_name)

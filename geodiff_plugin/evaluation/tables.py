@@ -128,7 +128,7 @@ def table_of_groups(
 ) -> Table:
     """A row for all values of the entries ``names``, with a cell of its records under each heading."""
     groups = grouped(records, *names).values()
-    rows = tuple(tuple(cell_of(own) for cell_of in columns.values()) for own in groups)
+    rows = tuple(tuple(cell_of(group) for cell_of in columns.values()) for group in groups)
     return Table(title, tuple(columns), rows, note)
 
 
@@ -142,17 +142,17 @@ def value_at(record: Record, path: str) -> Any:
 
 def mean_of(path: str, digits: int = 3, factor: float = 1.0) -> CellOf:
     """A column: the mean of an entry of the records that have it."""
-    return lambda own: mean_cell([factor * v for r in own if (v := value_at(r, path)) is not None], digits)
+    return lambda rows: mean_cell([factor * v for r in rows if (v := value_at(r, path)) is not None], digits)
 
 
 def most_of(name: str, digits: int = 3) -> CellOf:
     """A column: the largest value of an entry of the records."""
-    return lambda own: cell(max(record[name] for record in own), digits)
+    return lambda group: cell(max(record[name] for record in group), digits)
 
 
-def method_title(own: Sequence[Record]) -> str:
+def method_title(group: Sequence[Record]) -> str:
     """A column: the title of the method."""
-    return find_method(own[0]["method"]).title
+    return find_method(group[0]["method"]).title
 
 
 def label_of(record: Record) -> str:
@@ -181,8 +181,8 @@ def headline(record: Record) -> float | None:
 def by_method(records: Sequence[Record], value_of: Callable[[Record], Any]) -> dict[str, dict[str, Any]]:
     """``method -> label -> value`` over the finished records that have one."""
     values: dict[str, dict[str, Any]] = {}
-    for method, own in grouped(records, "method").items():
-        known = {label_of(record): value_of(record) for record in own if record["status"] == "ok"}
+    for method, group in grouped(records, "method").items():
+        known = {label_of(record): value_of(record) for record in group if record["status"] == "ok"}
         values[method] = {label: value for label, value in known.items() if value is not None}
     return values
 
@@ -197,7 +197,7 @@ def groups_of(records: Sequence[Record]) -> dict[str, set[str]]:
     kinds = (("rectified ", True), ("posed ", False))
     labels = {name: {label_of(r) for r in records if r.get("rectified") is kind} for name, kind in kinds}
     groups = {"": set().union(*labels.values())} | (labels if all(labels.values()) else {})
-    return {count_of_pairs(len(own), kind): own for kind, own in groups.items()}
+    return {count_of_pairs(len(members), kind): members for kind, members in groups.items()}
 
 
 def whole_mean(values: list[float | None], digits: int = 3) -> str:
@@ -210,13 +210,13 @@ def per_pair_table(
 ) -> Table:
     """One row per sample, one column of records each, then the means of every group."""
     header, records_of = zip(*columns, strict=True)
-    values = [{label_of(record): value_of(record) for record in own} for own in records_of]
+    values = [{label_of(record): value_of(record) for record in column} for column in records_of]
     every = list(chain(*records_of))
     labels = dict.fromkeys(map(label_of, every))
-    rows = [(label, *(cell(own.get(label), digits) for own in values)) for label in labels]
+    rows = [(label, *(cell(column.get(label), digits) for column in values)) for label in labels]
     for group, members in groups_of(every).items():
         if members:
-            means = (mean([own.get(label) for label in members], digits) for own in values)
+            means = (mean([column.get(label) for label in members], digits) for column in values)
             rows.append((f"mean of {group}", *means))
     return Table(title, ("pair", *header), tuple(rows), note)
 
@@ -224,10 +224,10 @@ def per_pair_table(
 def method_columns(records: Sequence[Record]) -> list[tuple[str, list[Record]]]:
     """Heading and records of each method; without metres it needs an oracle, which the heading says."""
     columns = []
-    for own in grouped(records, "method").values():
-        title, raw = method_title(own), [r["all_pixels"]["raw"] for r in own if r["status"] == "ok"]
+    for group in grouped(records, "method").values():
+        title, raw = method_title(group), [r["all_pixels"]["raw"] for r in group if r["status"] == "ok"]
         relative = raw and not any(raw) and "oracle" not in title
-        columns.append((f"{title} + oracle" if relative else title, own))
+        columns.append((f"{title} + oracle" if relative else title, group))
     return columns
 
 
@@ -235,17 +235,17 @@ def summary_table(records: Sequence[Record], members: Collection[str], title: st
     """Mean over some samples and its interval of every metric, a row per method as is and one aligned."""
     scores = [
         {"method": method, "suffix": suffix} | record["capped"][kind]
-        for method, own in grouped(records, "method").items()
+        for method, group in grouped(records, "method").items()
         for kind, suffix in (("raw", ""), ("aligned", ", aligned"))
-        for record in own
+        for record in group
         if record["status"] == "ok" and label_of(record) in members and record["capped"][kind]
     ]
 
     def with_interval(name: str) -> CellOf:
-        return lambda own: mean_with_interval([record[name] for record in own]).cell()
+        return lambda group: mean_with_interval([record[name] for record in group]).cell()
 
-    columns: dict[str, CellOf] = {"method": lambda own: method_title(own) + own[0]["suffix"]}
-    columns |= {"pairs": lambda own: str(len(own))}
+    columns: dict[str, CellOf] = {"method": lambda group: method_title(group) + group[0]["suffix"]}
+    columns |= {"pairs": lambda group: str(len(group))}
     columns |= {heading: with_interval(name) for name, heading in HEADINGS.items()}
     columns |= {"coverage": mean_of("coverage")}
     note = "Capped at 80 m for KITTI and 10 m for Booster; mean [95 %]."
@@ -355,7 +355,7 @@ def pairs_tables(records: Sequence[Record], reference: str = "guided") -> list[T
         per_pair_table(f"AbsRel of {pairs_of(records)}", columns, headline, 3, note),
         per_pair_table("Seconds", columns, lambda record: record.get("seconds"), 1),
         *([versus_table(records, reference)] if any(r["method"] == reference for r in records) else []),
-        *(summary_table(records, own, f"All metrics, {group}") for group, own in groups_of(records).items()),
+        *(summary_table(records, labels, f"All metrics, {g}") for g, labels in groups_of(records).items()),
         *(details_table(records, title) for title in DETAILS),
         confidence_table(records),
     ]

@@ -96,11 +96,11 @@ def read_capture(
         bad_value("PATH", "a capture", f"{source}, which does not exist", error=MissingFileError)
     with reading_whole(source, "capture"):
         read = (layout(source, None if trajectory is None else Path(trajectory)) for layout in LAYOUTS)
-        found = next((each for each in read if each is not None), None)
-        if found is None:
+        layout = next((each for each in read if each is not None), None)
+        if layout is None:
             expected = "a COLMAP model, a transforms.json, 7-Scenes, ScanNet or TUM RGB-D, a video or images"
             bad_value("PATH", expected, f"{source}, which is none of these")
-        kind, unit, pairs = found
+        kind, unit, pairs = layout
         whole = [(frame, camera) for frame, camera in pairs if frame.image.is_file()]
         frames = [_finished(frame, camera, K, fov) for frame, camera in whole]
     tracked = any(frame.E is not None for frame in frames)

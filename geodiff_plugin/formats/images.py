@@ -262,8 +262,8 @@ def undistorted_pixels(pixels: np.ndarray, K: np.ndarray, distortion: Distortion
         straight = cv2.undistortImagePoints(taken, K, coefficients, None, UNTIL)
         rays = cv2.convertPointsToHomogeneous(straight) @ np.linalg.inv(K).T
         back = cv2.projectPoints(rays, none, none, K, coefficients)[0]
-    found = np.abs(back - taken).max(axis=2) < TOLERANCE_PX
-    return np.where(found, straight[:, 0], np.nan)
+    inverted = np.abs(back - taken).max(axis=2) < TOLERANCE_PX
+    return np.where(inverted, straight[:, 0], np.nan)
 
 
 def undistorted_points(depth_m: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:

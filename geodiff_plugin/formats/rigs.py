@@ -160,7 +160,7 @@ def names_of_pair(names: Collection[str], choice: CameraChoice) -> tuple[str, st
     """The names in a file of both images; they and the paths may lack folders, or a suffix."""
     if choice.image_names is None:
         bad_value("image_names", "given, as ('left.jpg', 'right.jpg'), for a file of many images", "none")
-    found = []
+    numbers = []
     for wanted in choice.image_names:
         in_common = {name: _parts_in_common(name, str(wanted)) for name in names}
         most = max(in_common.values(), default=0)
@@ -171,10 +171,10 @@ def names_of_pair(names: Collection[str], choice: CameraChoice) -> tuple[str, st
         if len(fitting) > 1:
             got = f"{wanted}, which may be {' and '.join(fitting[:2])}"
             bad_value("the image", "one image of the file", got, "Add its folder.")
-        found += fitting
-    if found[0] == found[1]:
-        bad_value("the images", "two of those in the file", f"{found[0]} for both", "Check their names.")
-    return found[0], found[1]
+        numbers += fitting
+    if numbers[0] == numbers[1]:
+        bad_value("the images", "two of those in the file", f"{numbers[0]} for both", "Check their names.")
+    return numbers[0], numbers[1]
 
 
 def _parts_in_common(name: str, wanted: str) -> int:

@@ -118,12 +118,12 @@ def solve_capture(
             these = _some_names([names[int(i)] for i in blurred])
             notes.append(f"{these}: blurred or without texture; they are no good neighbours of others.")
         if E is None:
-            found = _from_nothing(base, notes)
+            result = _from_nothing(base, notes)
         else:
-            found = _from_given(
+            result = _from_given(
                 base, _in_convention(base, np.asarray(E, float), notes), notes, poses == "refined"
             )
-        return _noted(found, notes, names)
+        return _noted(result, notes, names)
 
 
 def _some_names(names: Sequence[str]) -> str:
@@ -228,7 +228,7 @@ def _from_given(base: Reconstruction, given: np.ndarray, notes: list[str], refin
 
     start = started()
     if not refine or start.num_points3D() < FEWEST_OBSERVATIONS:
-        return replace(_found(base, start, "given", given, as_given), E=given)
+        return replace(_result(base, start, "given", given, as_given), E=given)
     by_given = base.depths(start)
     focal = len(base) >= FEWEST_FOR_FOCAL
     model = _adjusted(base, start, given, focal)
@@ -238,11 +238,11 @@ def _from_given(base: Reconstruction, given: np.ndarray, notes: list[str], refin
     after = _residuals_px(base.poses(model), base.K(model), matches)
     if not _median_px(after) < LEAST_GAIN * as_given[0]:
         notes.append(f"The given poses fit as well as any ({as_given[0]:.2f} px) and are kept.")
-        return replace(_found(base, started(), "kept", given, as_given), E=given)
-    found = _found(base, model, "solved", given, (as_given[0], _median_px(after)))
+        return replace(_result(base, started(), "kept", given, as_given), E=given)
+    result = _result(base, model, "solved", given, (as_given[0], _median_px(after)))
     worse = _of_frames(matches, after, len(base)) > _of_frames(matches, before, len(base))
-    found = replace(found, connected=found.connected & ~worse)
-    return _scaled(found, by_given, base.depths(model))
+    result = replace(result, connected=result.connected & ~worse)
+    return _scaled(result, by_given, base.depths(model))
 
 
 def _adjusted(base: Reconstruction, model: Any, given: np.ndarray, focal: bool) -> Any:
@@ -255,11 +255,11 @@ def _adjusted(base: Reconstruction, model: Any, given: np.ndarray, focal: bool) 
 
 
 def _scaled(
-    found: SolvedCapture, by_given: list[dict[int, float]], solved: list[dict[int, float]]
+    result: SolvedCapture, by_given: list[dict[int, float]], solved: list[dict[int, float]]
 ) -> SolvedCapture:
     """The capture at one scale, from the trajectory and from the depth of the scene under the given poses."""
-    assert found.E_given is not None
-    centres, given = found.E[:, :3, 3], found.E_given[:, :3, 3]
+    assert result.E_given is not None
+    centres, given = result.E[:, :3, 3], result.E_given[:, :3, 3]
     ratios = np.full(len(centres), np.nan)
     for i, (a, b) in enumerate(zip(by_given, solved, strict=True)):
         logs = [math.log(a[k] / b[k]) for k in a.keys() & b.keys()]
@@ -280,12 +280,12 @@ def _scaled(
     _, Q = _similarity(centres, given)
     turned = scale * centres @ Q.T
     shift = np.median(given - turned, axis=0)
-    E = found.E.copy()
+    E = result.E.copy()
     E[:, :3, :3], E[:, :3, 3] = Q @ E[:, :3, :3], turned + shift
     return replace(
-        found,
+        result,
         E=E,
-        points=scale * found.points @ Q.T + shift,
+        points=scale * result.points @ Q.T + shift,
         scale_trajectory=math.exp(trajectory[0]),
         scale_depth=math.exp(depth[0]),
         scale_spread=float(weights.sum() ** -0.5),
@@ -320,7 +320,7 @@ def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
     return scale, Q
 
 
-def _found(
+def _result(
     base: Reconstruction, model: Any, status: str, given: np.ndarray | None, residuals: tuple[float, float]
 ) -> SolvedCapture:
     """What a model says, in its world's frame."""
@@ -345,9 +345,9 @@ def _found(
     )
 
 
-def _noted(found: SolvedCapture, notes: list[str], names: Sequence[str]) -> SolvedCapture:
+def _noted(result: SolvedCapture, notes: list[str], names: Sequence[str]) -> SolvedCapture:
     """The capture with sentences on its scale and on frames that are not connected."""
-    ratio, spread = found.scale_trajectory / found.scale_depth, found.scale_spread
+    ratio, spread = result.scale_trajectory / result.scale_depth, result.scale_spread
     if abs(math.log(ratio)) > DISAGREES:
         notes.append(
             "The given positions and the depth of the scene under the given poses disagree on the scale, "
@@ -355,14 +355,14 @@ def _noted(found: SolvedCapture, notes: list[str], names: Sequence[str]) -> Solv
         )
     if spread > DISAGREES:
         notes.append(f"The scale is uncertain by {100 * spread:.0f} %: give --known-length for an exact one.")
-    lost = [name for name, connected in zip(names, found.connected, strict=True) if not connected]
-    if lost and found.status != "given":
-        kept = "have no pose and are skipped" if found.E_given is None else "keep their poses as given"
+    lost = [name for name, connected in zip(names, result.connected, strict=True) if not connected]
+    if lost and result.status != "given":
+        kept = "have no pose and are skipped" if result.E_given is None else "keep their poses as given"
         notes.append(
             f"{len(lost)} of {len(names)} frames share too few points with others, or fit no better "
             f"where the others put them, and {kept}: {_some_names(lost)}."
         )
-    return replace(found, notes=tuple(notes))
+    return replace(result, notes=tuple(notes))
 
 
 def _from_nothing(base: Reconstruction, notes: list[str]) -> SolvedCapture:
@@ -376,4 +376,4 @@ def _from_nothing(base: Reconstruction, notes: list[str]) -> SolvedCapture:
     after = _median_px(_residuals_px(E, K, [m for m in base.matches if there[[m[0], m[1]]].all()]))
     if len(models) > 1:
         notes.append(f"{len(models)} parts are not connected; the largest is used.")
-    return _found(base, models[0], "estimated", None, (math.nan, after))
+    return _result(base, models[0], "estimated", None, (math.nan, after))

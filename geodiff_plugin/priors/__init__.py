@@ -23,7 +23,7 @@ from geodiff_plugin.priors.ppd import PPDPipeline
 from geodiff_plugin.priors.transformers_depth import TransformersDepthPipeline
 from geodiff_plugin.scale.space import SPACES
 
-__all__ = ["BUNDLED_FOLDER", "PRIORS", "DepthPrior", "FoundPrior", "find_prior", "load_prior", "prior_of"]
+__all__ = ["BUNDLED_FOLDER", "PRIORS", "DepthPrior", "PriorSource", "find_prior", "load_prior", "prior_of"]
 
 #: The first adapter that recognises a folder loads it, so specific ones stand before general ones.
 PRIORS: dict[str, type[DepthPrior]] = {
@@ -52,7 +52,7 @@ def prior_of(pipe: Any) -> DepthPrior:
 
 
 @dataclass(frozen=True)
-class FoundPrior:
+class PriorSource:
     """A prior's folder and the ``key`` of its adapter in ``PRIORS``; weights are read by ``load``."""
 
     key: str
@@ -83,18 +83,18 @@ class FoundPrior:
         return pipe.to(device) if device is not None else pipe
 
 
-def find_prior(name: str | Path, variant: str | None = None, **hub: Any) -> FoundPrior:
+def find_prior(name: str | Path, variant: str | None = None, **hub: Any) -> PriorSource:
     """As ``load_prior``; ``KEY:NAME`` with a key of ``PRIORS`` chooses the adapter."""
     typed = str(name)
     if typed == MAP_LAYOUT.name:
-        return FoundPrior("map", MAP_LAYOUT)
+        return PriorSource("map", MAP_LAYOUT)
     key, _, rest = typed.partition(":")
     if rest and key in PRIORS:
         typed = rest
     else:
         refuse(typed)
         key = _recognise(Layout(fetch(typed, hub), typed))
-    return FoundPrior(key, Layout(fetch(typed, hub, weights=True, variant=variant), typed, variant))
+    return PriorSource(key, Layout(fetch(typed, hub, weights=True, variant=variant), typed, variant))
 
 
 def _recognise(layout: Layout) -> str:

@@ -163,12 +163,12 @@ def _annotated(pipeline_class: type[Any]) -> dict[str, type[Any]]:
     """Component classes by the names of a constructor's parameters; none of a pipeline of diffusers."""
     if pipeline_class.__module__.startswith("diffusers."):
         return {}
-    found = {}
+    classes = {}
     for name, hint in typing.get_type_hints(pipeline_class.__init__).items():
         for cls in (hint, *typing.get_args(hint)):  # with None it is optional
             if hasattr(cls, "from_pretrained"):
-                found[name] = cls
-    return found
+                classes[name] = cls
+    return classes
 
 
 def load_component(

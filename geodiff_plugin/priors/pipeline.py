@@ -80,7 +80,7 @@ class DepthPrior:
         deterministic: the same image always gives the same map, so an ensemble has one member.
         takes_prompt: the call takes ``prompt_depth``, depths that the network starts from.
         depth_channels: depth channels of the scheduler's latents; guidance does not change the others.
-        own_range: of a metric prior, ``(N * E, 2)`` metres at 0 and at 1 of its maps; else ``None``.
+        metric_range: of a metric prior, ``(N * E, 2)`` metres at 0 and at 1 of its maps; else ``None``.
         valid: ``(N * E, 1, H, W)`` bool, pixels of the processing grid with a prior depth; ``None`` for all.
     """
 
@@ -89,7 +89,7 @@ class DepthPrior:
     deterministic = False
     takes_prompt = False
     depth_channels = slice(None)
-    own_range: Tensor | None = None
+    metric_range: Tensor | None = None
     valid: Tensor | None = None
 
     @property

@@ -258,10 +258,10 @@ class TransformersDepthPipeline(DirectMapPipeline):
             self.predict(part.float() / 2 + 0.5, size, prompt)
             for part, prompt in zip(parts, prompts, strict=True)
         ]
-        self.own_range = None
+        self.metric_range = None
         if self.metric or prompt_depth is not None:
             ends = torch.cat([torch.stack([self.metres(v) for v in range_of(part)], 1) for part in maps])
-            self.own_range = ends.clamp_min(NEAREST_M).repeat_interleave(ensemble_size, dim=0)
+            self.metric_range = ends.clamp_min(NEAREST_M).repeat_interleave(ensemble_size, dim=0)
         return {"image_latent": unit_range(torch.cat(maps)).repeat_interleave(ensemble_size, dim=0)}
 
     def metres(self, values: Tensor) -> Tensor:

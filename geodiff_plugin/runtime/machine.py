@@ -41,8 +41,8 @@ def pick_device(name: str) -> torch.device:
         bad_value("--device", "auto, cpu, cuda, cuda:N or mps", repr(name))
     count = here[device.type]
     if (device.index or 0) >= count:
-        found = f"PyTorch finds {count or 'no'} {device.type} here."
-        bad_value("--device", "a device of this machine", repr(name), found)
+        got = f"PyTorch finds {count or 'no'} {device.type} here."
+        bad_value("--device", "a device of this machine", repr(name), got)
     return device
 
 

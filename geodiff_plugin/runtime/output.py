@@ -175,7 +175,7 @@ def assemble_output(
         scale=of_members("scale"),
         shift=of_members("shift"),
         global_scale=of_members("g_s"),
-        own_scale=None if over_prior is None else over_prior.median(1).values.reshape(count, -1).cpu(),
+        prior_scale=None if over_prior is None else over_prior.median(1).values.reshape(count, -1).cpu(),
         visible=out(visible),
         photometric_error=out(error),
         confidence=out(confidence),
@@ -240,7 +240,7 @@ def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> Metr
     )
     output.prediction = output.prediction * factor
     output.uncertainty = None if output.uncertainty is None else output.uncertainty * factor
-    for name in ("global_scale", "own_scale"):
+    for name in ("global_scale", "prior_scale"):
         setattr(output, name, getattr(output, name) * factor)
     output.history = [replace(step, g_s=step.g_s * factor) for step in output.history]
     output.poses = [
@@ -266,7 +266,7 @@ def _indicators(
     if confidence is not None:
         more["confidence"] = float(confidence[image].mean())
     if over_prior is not None:
-        more["own_ratio"] = float(over_prior.reshape(len(run.evidence), -1)[image].median())
+        more["prior_ratio"] = float(over_prior.reshape(len(run.evidence), -1)[image].median())
     samples, evidence, config = run.samples_of(image), run.evidence[image], run.config
     order = float(torch.stack([t.order[i] for t, i in samples if t.order is not None]).nanmean())
     if evidence.matches is None and evidence.native_views:

@@ -187,7 +187,7 @@ class GuidedRun:
         """Start the trajectory of the next chunk, with its timesteps on the CPU."""
         first = len(self.trajectories) * self.batch_size
         chunk = slice(first, first + self.batch_size)
-        plan, prior, metres = self._plan, self.prior, self.prior.own_range
+        plan, prior, metres = self._plan, self.prior, self.prior.metric_range
         self.trajectories.append(
             Trajectory(
                 self.config,

@@ -92,7 +92,7 @@ class Indicators:
     at_end: float = 0.0  # share of the confident matches on the first or the last plane of a given range
     baseline_m: float = 0.0  # distance of the first right camera; 0 without one, or where it has no unit
     view_deg: float = math.nan  # horizontal field of view that K gives the left image
-    own_ratio: float = math.nan  # median of the depth over a metric prior's depth
+    prior_ratio: float = math.nan  # median of the depth over a metric prior's depth
     epipolar_px: float = math.nan  # median distance of matches from their epipolar lines, the worst view's
     scale_spread: float = math.nan  # relative standard deviation of a refined pose's scale, if in metres
     off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
@@ -333,9 +333,9 @@ def _remarks(run: Indicators, trusted: bool) -> list[str]:
             f"K gives the left image a field of view of {run.view_deg:.0f} degrees: is it for an image of "
             "another size?"
         )
-    if _log(run.own_ratio) > OWN_METRES:
+    if _log(run.prior_ratio) > OWN_METRES:
         remarks.append(
-            f"The depth is {run.own_ratio:.2g} times the prior's own metres: is the baseline in metres, "
+            f"The depth is {run.prior_ratio:.2g} times the prior's own metres: is the baseline in metres, "
             "and K for an image of this size? Or is the scene of a kind that the prior does not know?"
         )
     if not _points_wrong(run) and (sentence := _why_points(run)):

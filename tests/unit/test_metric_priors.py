@@ -38,7 +38,7 @@ def guided(pipe, pair, **knobs):
 @pytest.mark.parametrize("kind", ["zoedepth", "glpn", "tipsv2", "depth_pro"])
 def test_a_run_says_how_far_the_priors_metres_were_off(kind, textured_plane):
     out = guided(knowing(kind, textured_plane.depth_m, factor=0.5), textured_plane)
-    assert out.own_scale.shape == (1, 1) and float(out.own_scale) == pytest.approx(2.0, rel=0.02)
+    assert out.prior_scale.shape == (1, 1) and float(out.prior_scale) == pytest.approx(2.0, rel=0.02)
     assert any("2 times the prior's own metres" in sentence for sentence in out.warnings)
     assert np.median(out.prediction[0, ..., 0] / textured_plane.depth_m) == pytest.approx(1.0, rel=0.01)
 
@@ -46,13 +46,13 @@ def test_a_run_says_how_far_the_priors_metres_were_off(kind, textured_plane):
 def test_prompt_depth_anything_is_given_what_is_known_unless_it_is_given_depths(textured_plane):
     pipe = knowing("prompt_depth_anything", textured_plane.depth_m)
     out = guided(pipe, textured_plane)
-    assert float(out.own_scale) == pytest.approx(1.0, abs=0.01)  # its map is in metres with a prompt
+    assert float(out.prior_scale) == pytest.approx(1.0, abs=0.01)  # its map is in metres with a prompt
     call = {"image": Image.fromarray(textured_plane.left), "processing_resolution": 64}
     pipe(**call)
-    assert pipe.own_range is None  # without guidance it is a relative prior
+    assert pipe.metric_range is None  # without guidance it is a relative prior
     own = torch.linspace(7.0, 9.0, 24).view(1, 1, 4, 6)
     pipe(**call, prompt_depth=own)
-    assert pipe.own_range[0].tolist() == pytest.approx([7.0, 9.0], abs=0.1)
+    assert pipe.metric_range[0].tolist() == pytest.approx([7.0, 9.0], abs=0.1)
     with pytest.raises(ValueError, match="prompt_depth"):
         make_transformers("zoedepth")(**call, prompt_depth=own)
 
@@ -76,7 +76,7 @@ def test_without_a_length_the_metres_are_those_of_a_metric_prior():
     assert metric.rescaled == pytest.approx(baseline, rel=0.03)
     assert np.median(metric.prediction[0, ..., 0] / depth_m) == pytest.approx(1.0, rel=0.025)
     assert np.linalg.norm(metric.poses[0].E[0][:3, 3]) == pytest.approx(metric.rescaled, rel=1e-5)
-    assert float(metric.own_scale) == pytest.approx(1.0, rel=1e-5)
+    assert float(metric.prior_scale) == pytest.approx(1.0, rel=1e-5)
     assert any("metres are the prior's own" in sentence for sentence in metric.warnings)
     assert not any("no unit" in sentence for sentence in metric.warnings)
     assert relative.unit is None and relative.scale_from == "none" and relative.rescaled == 1.0

@@ -24,7 +24,7 @@ def test_a_good_run_is_trusted_in_silence():
     nothing = judge(Indicators())
     assert nothing.status == "not judged" and not nothing.trusted and "not judged" in nothing.sentence
     for signs in (
-        {"own_ratio": 1.4, "view_deg": 21.0},
+        {"prior_ratio": 1.4, "view_deg": 21.0},
         {"epipolar_px": 1.5, "scale_spread": 0.09},
         {"scale_spread": 0.2, "points": 99},  # known depths give the scale
         {"on_edge": True},  # a street's sky
@@ -74,7 +74,7 @@ def test_reasons(signs, words):
     ("signs", "words"),
     [
         ({"view_deg": 12.0}, "12 degrees"),
-        ({"own_ratio": 2.1}, "2.1 times the prior's own metres"),
+        ({"prior_ratio": 2.1}, "2.1 times the prior's own metres"),
         ({"points_ratio": 1.15, "points": 99}, "1.15 times as far"),
         ({"points": 1}, "Known depths that lie in the image: 1"),
         ({"epipolar_px": 2.4}, "2.4 px beside"),

@@ -133,7 +133,7 @@ class Method:
         name = self.name if self.seed is None else self.name.removesuffix(f"#{self.seed}")
         return name if self.prior is None else name.removesuffix(f"@{self.prior}")
 
-    def own_settings(self, settings: Settings) -> Settings:
+    def adapted(self, settings: Settings) -> Settings:
         """The settings with the prior and the seed that the method is bound to, if it is."""
         prior = settings.prior if self.prior is None else self.prior
         return replace(settings, prior=prior, seed=settings.seed if self.seed is None else self.seed)
