@@ -22,6 +22,8 @@ LEAST_WEIGHT = 0.05
 RISES = 0.4
 #: So many other frames must agree with each other to replace a depth that none of them confirms.
 OUTVOTES = 2
+#: Side and rounds of the median that smooths depth around what others replace.
+SMOOTHED, ROUNDS = 5, 3
 #: Frames before and after a frame of a video that it is checked against.
 STEADY = 3
 #: Confidence from which others do not outvote what may have moved.
@@ -72,7 +74,8 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False
     """A frame, with its depth averaged with that of others where they agree, ``confirmed`` and ``asked``.
 
     A depth that no other frame confirms gives way to one on which several others agree and which together
-    count more; where things may be ``moving``, only if its confidence is low. Inverse depths are averaged.
+    count more; where things may be ``moving``, only if its confidence is low. Inverse depths are averaged; a
+    median smooths them around what others replace.
 
     Source: Merrell et al. 2007, S4: depth maps rendered into one view, supported by those that agree.
     """
@@ -90,15 +93,20 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False
         missing = missing * np.where(same, 1.0 - RISES * sure, 1.0)
     inverse, confidence = above / total, 1.0 - missing
     alone = (confirmed == 0) & (frame.confidence < (SURE if moving else np.inf))
-    rendered = [_rendered(other, frame) for other in others] if alone.any() else []
-    for maps in rendered:  # a surface of another frame before ours speaks against ours
+    seen_by = [rendered(other, frame, other.confidence) for other in others] if alone.any() else []
+    for maps in seen_by:  # a surface of another frame before ours speaks against ours
         asked += alone & (maps[0] > 0) & (maps[0] < (1 - SAME_SHARE) * frame.depth)
-    if len(rendered) >= OUTVOTES:
-        votes, share, new, new_confidence = _vote(rendered, alone)
+    if len(seen_by) >= OUTVOTES:
+        votes, share, new, new_confidence = _vote(seen_by, alone)
         lost = (votes >= OUTVOTES) & (share > weight[alone])
         at = np.flatnonzero(alone)[lost]
         for values, by_others in ((inverse, new), (confidence, new_confidence), (confirmed, votes)):
             values.flat[at] = by_others[lost]
+        replaced = np.zeros(inverse.shape, np.uint8)
+        replaced.flat[at] = 1
+        near = cv2.dilate(replaced, np.ones((3, 3), np.uint8)) > 0
+        for _ in range(ROUNDS):
+            inverse = np.where(near, cv2.medianBlur(inverse.astype(np.float32), SMOOTHED), inverse)
     return replace(
         frame,
         depth=(1.0 / inverse).astype(np.float32),
@@ -125,22 +133,32 @@ def _depth_by(other: DepthFrame, frame: DepthFrame) -> Maps:
     return depth, other.confidence[row, column], seen & (there > (1 - SAME_SHARE) * z), same
 
 
-def _rendered(other: DepthFrame, frame: DepthFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Another frame's depth and confidence as a frame's camera sees them, 0 where no pixel falls."""
+def rendered(other: DepthFrame, frame: DepthFrame, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Another frame's depth, and ``values (H, W, ...)`` of its pixels, as a frame's camera sees them.
+
+    The nearest point is seen. Gaps of a pixel or two between the points are filled; 0 where nothing is seen.
+    """
     row, column, z, inside = seen_in(other, frame)
-    order = np.argsort(-z[inside])  # the nearest is written last
-    at = (row[inside] * frame.depth.shape[1] + column[inside])[order]
-    depth, sure = np.zeros((2, *frame.depth.shape))
-    depth.flat[at], sure.flat[at] = z[inside][order], other.confidence[inside][order]
-    return depth, sure
+    order = np.argsort(-z[inside], kind="stable")  # the nearest is written last
+    at = row[inside][order], column[inside][order]
+    maps = np.zeros(frame.depth.shape), np.zeros((*frame.depth.shape, *values.shape[2:]), values.dtype)
+    for into, of in zip(maps, (z, values), strict=True):
+        into[at] = of[inside][order]
+    height, width = frame.depth.shape
+    for v, u in ((0, 1), (2, 1), (1, 0), (1, 2)):
+        gaps = maps[0] == 0
+        for into in maps:
+            around = np.pad(into, ((1, 1), (1, 1), *((0, 0),) * (into.ndim - 2)))
+            into[gaps] = around[v : v + height, u : u + width][gaps]
+    return maps
 
 
-def _vote(rendered: Sequence[tuple[np.ndarray, np.ndarray]], mask: np.ndarray) -> Maps:
+def _vote(seen_by: Sequence[tuple[np.ndarray, np.ndarray]], mask: np.ndarray) -> Maps:
     """The depth that most of the other frames agree on, at the ``n`` pixels of a mask.
 
     ``(n,)`` each: how many agree, their weight, their mean inverse depth and joint confidence.
     """
-    depths, sures = (np.stack([maps[k][mask] for maps in rendered]) for k in (0, 1))
+    depths, sures = (np.stack([maps[k][mask] for maps in seen_by]) for k in (0, 1))
     weights = np.where(depths > 0, LEAST_WEIGHT + sures, 0.0)
     inverse = 1.0 / np.where(depths > 0, depths, 1.0)
     best = [np.zeros(depths.shape[1]) for _ in range(4)]

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
+from geodiff_plugin import plotting
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.capture.agreement import DepthFrame, agreed, scene_poses, steadied
 from geodiff_plugin.capture.capture import Capture, choose_neighbours
@@ -18,7 +19,6 @@ from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb, write
 from geodiff_plugin.formats.depth import write_depth_mm, write_depth_npy
 from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.formats.sfm import write_colmap
-from geodiff_plugin.plotting import depth_figure, depth_frames, grid
 from geodiff_plugin.pose.capture import Observations
 
 #: Depth and confidence of a frame by its own run, which agreement starts from whenever it is made anew.
@@ -26,6 +26,8 @@ ALONE = ("depth_alone", "confidence_alone")
 AGREED = ("depth", "confidence", "confirmed", "asked")
 #: Frames that a frame is checked against, frames on the contact sheet, points of the GLB.
 OTHERS, ON_SHEET, GLB_POINTS = 6, 24, 400_000
+#: Pixels of the video, whose frames are a photograph and its depth side by side, and frames a second.
+VIDEO_SIZE, VIDEO_FPS = (1280, 480), 5.0
 #: Points closer than this share of the median depth are one; points of lower confidence are left out.
 CELL_SHARE, LEAST_CONFIDENCE = 0.004, 0.5
 #: Points of one frame at most; more would not show in a cloud of many frames.
@@ -66,7 +68,7 @@ def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[s
 def _write_agreed(folder: Path, frame: DepthFrame, unit: str | None) -> None:
     write_depth_npy(folder / "depth.npy", frame.depth)
     write_depth_mm(folder / "depth_mm.png", frame.depth)
-    depth_figure(frame.depth, unit=unit).save(folder / "depth.png")
+    plotting.depth_figure(frame.depth, unit=unit).save(folder / "depth.png")
     for file in AGREED[1:]:
         with atomic_path(folder / f"{file}.npy") as temporary:
             np.save(temporary, getattr(frame, file))
@@ -125,21 +127,39 @@ def write_results(
         seen = [solved.seen[capture.names.index(name)] for name in names]
         write_workspace(out / "colmap", map(load, names), capture.image, solved.points, seen)
     _sheet(capture, out, names, doubted)
+    _video(capture, out, names)
     return {"cloud_points": count}
+
+
+def _pixels(capture: Capture, name: str) -> np.ndarray:
+    return np.rint(capture.image(name) * 255).astype(np.uint8)
 
 
 def _sheet(capture: Capture, out: Path, names: Sequence[str], doubted: Sequence[str]) -> None:
     """A picture of evenly chosen frames and their depth, in the colours of one range where they are alike."""
     shown = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, ON_SHEET).astype(int))]
     depths, unit = [np.load(out / name / "depth.npy") for name in shown], capture.unit
-    alike = len({depth.shape for depth in depths}) == 1
-    figures = depth_frames(depths, unit=unit) if alike else (depth_figure(d, unit=unit) for d in depths)
+    alike, figure = len({depth.shape for depth in depths}) == 1, partial(plotting.depth_figure, unit=unit)
+    figures = plotting.depth_frames(depths, unit=unit) if alike else map(figure, depths)
     cells: list[Image.Image] = []
-    for name, figure in zip(shown, figures, strict=True):
-        cells += [Image.fromarray(np.rint(capture.image(name) * 255).astype(np.uint8)), figure]
+    for name, drawn in zip(shown, figures, strict=True):
+        cells += [Image.fromarray(_pixels(capture, name)), drawn]
     titles = [t for name in shown for t in (name, "depth, not trusted" if name in doubted else "depth")]
     with atomic_path(out / "sheet.jpg") as temporary:
-        grid(cells, titles, columns=min(4, len(cells)), cell_width=360).save(temporary, quality=88)
+        plotting.grid(cells, titles, columns=min(4, len(cells)), cell_width=360).save(temporary, quality=88)
+
+
+def _video(capture: Capture, out: Path, names: Sequence[str]) -> None:
+    """Every frame beside its depth, all in the colours of one range; frames of other sizes are padded."""
+    maps = [np.load(out / name / "depth.npy", mmap_mode="r") for name in names]
+    near, far = plotting.depth_range(np.concatenate([depth[::8, ::8].reshape(-1) for depth in maps])[None])
+
+    def frames() -> Iterator[Image.Image]:
+        for name, depth in zip(names, maps, strict=True):
+            halves = _pixels(capture, name), plotting.colour_depth(depth, near, far)
+            yield ImageOps.pad(Image.fromarray(np.hstack(halves)), VIDEO_SIZE)
+
+    plotting.write_depth_video(out / "video.mp4", frames(), VIDEO_FPS)
 
 
 def normals_of(depth: np.ndarray, K: np.ndarray) -> np.ndarray:

@@ -25,20 +25,10 @@ from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, start_pair
 from geodiff_plugin.cli.outputs import read_report
 from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, options_of, start_many
 from geodiff_plugin.cli.terminal import collected_warnings, new_table, say, show
+from geodiff_plugin.formats import recordings
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import REPORT, atomic_path, reason_of, write_text
 from geodiff_plugin.formats.reading import has_pose_per_image
-from geodiff_plugin.formats.recordings import (
-    BAG_SUFFIXES,
-    BagReader,
-    Stamp,
-    VideoReader,
-    both_halves,
-    is_bag,
-    list_pairs,
-    stereo_calibration,
-    write_depth_bag,
-)
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.guidance.inputs import left_images
 from geodiff_plugin.options import flag_of
@@ -84,7 +74,7 @@ class Stages:
 
     def __init__(self, options: DepthOptions, device: torch.device, pipe: Any = None, among: int = 2) -> None:
         self._options, self._device, self._pipe, self._among = options, device, pipe, among
-        self._videos, self._open = dict[Path, VideoReader | BagReader](), ExitStack()
+        self._videos, self._open = dict[Path, recordings.VideoReader | recordings.BagReader](), ExitStack()
         self._folders: dict[str, ExitStack] = {}
 
     def close(self) -> None:
@@ -109,11 +99,13 @@ class Stages:
         if (frame := ref.frame) is None:
             return None
         for path in {ref.left, ref.right or ref.left} - set(self._videos):
-            bag = (self._options.bag_topics(), self._options.tolerance) if is_bag(path) else None
-            reader: Any = VideoReader(path) if bag is None else BagReader(path, *bag)
+            bag = (self._options.bag_topics(), self._options.tolerance) if recordings.is_bag(path) else None
+            reader: Any = recordings.VideoReader(path) if bag is None else recordings.BagReader(path, *bag)
             self._videos[path] = self._open.enter_context(reader)
         left = self._videos[ref.left].read(frame)
-        return both_halves(left, "LEFT") if ref.right is None else (left, self._videos[ref.right].read(frame))
+        if ref.right is None:
+            return recordings.both_halves(left, "LEFT")
+        return left, self._videos[ref.right].read(frame)
 
     def evidence(self, job: Job) -> Job:
         """What the views say by themselves, into a store of the pair's own, where the call finds it."""
@@ -324,23 +316,25 @@ def _answer(rows: Sequence[Row], options: DepthOptions, out: Path) -> None:
 def run_bag(options: DepthOptions) -> bool:
     """Depth of every pair of a bag as a bag, by way of the folder ``NAME-frames``; whether one failed."""
     out, topics = options.out or Path("depth.mcap"), options.bag_topics()
-    if out.suffix not in BAG_SUFFIXES or out.is_dir():
-        bad_value("--out", f"a file that ends in {' or '.join(BAG_SUFFIXES)}, as LEFT is a bag", out)
+    if out.suffix not in recordings.BAG_SUFFIXES or out.is_dir():
+        bad_value(
+            "--out", f"a file that ends in {' or '.join(recordings.BAG_SUFFIXES)}, as LEFT is a bag", out
+        )
     if out.exists() and not options.overwrite:
         bad_value("--out", "a new file", f"{out}, which exists", "Name another, or add --overwrite.")
-    pairs = list_pairs(options.left, topics, options.tolerance)
+    pairs = recordings.list_pairs(options.left, topics, options.tolerance)
     frames = out.with_name(f"{out.stem}-frames")
     options, frame_id = _with_its_cameras(replace(options, out=frames), frames)
     refs = start_many(options)
     failed = run_many(options, refs)
 
-    def results() -> Iterator[tuple[Stamp, np.ndarray, np.ndarray]]:
+    def results() -> Iterator[tuple[recordings.Stamp, np.ndarray, np.ndarray]]:
         for ref, (stamp, _) in zip(refs, pairs, strict=True):
             if report := read_report(frames / ref.name):
                 depth_m = np.load(frames / ref.name / "depth.npy", allow_pickle=False)
                 yield stamp, depth_m, np.reshape(report["K"], (3, 3))
 
-    count = write_depth_bag(out, results(), frame_id, options.encoding)
+    count = recordings.write_depth_bag(out, results(), frame_id, options.encoding)
     if not options.quiet:
         say(f"{out}: {count} depth images ({options.encoding}) of {len(pairs)} pairs")
     return failed
@@ -350,7 +344,7 @@ def _with_its_cameras(options: DepthOptions, folder: Path) -> tuple[DepthOptions
     """The calibration of a bag in files of a folder unless cameras are given, and its frame's name."""
     if options.calib or any(getattr(options, name) is not None for name in (*PARAMETERS, "k", "e")):
         return options, "left"
-    texts, frame_id = stereo_calibration(options.left, options.bag_topics())
+    texts, frame_id = recordings.stereo_calibration(options.left, options.bag_topics())
     files = tuple(folder / f"camera_info_{number}.yaml" for number in range(len(texts)))
     for file, text in zip(files, texts, strict=True):
         if not file.is_file() or file.read_text(encoding="utf-8") != text:  # else results were made by it

@@ -14,34 +14,15 @@ import numpy as np
 import torch
 from PIL import Image
 
+from geodiff_plugin import formats, plotting
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.inputs import Inputs
 from geodiff_plugin.cli.options import DepthOptions, told_apart
 from geodiff_plugin.cli.terminal import say
-from geodiff_plugin.formats import (
-    check_file,
-    flying_points,
-    make_cloud,
-    make_mesh,
-    write_colmap,
-    write_depth_mm,
-    write_depth_npy,
-    write_glb,
-    write_pfm,
-    write_ply,
-)
 from geodiff_plugin.formats.depth import disparity_of_depth
 from geodiff_plugin.formats.files import read_npy
 from geodiff_plugin.formats.out import REPORT, write_text
 from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.plotting import (
-    check_video,
-    depth_figure,
-    depth_frames,
-    overview,
-    share_figure,
-    write_depth_video,
-)
 from geodiff_plugin.runtime.confidence import expected_error
 from geodiff_plugin.runtime.machine import versions
 from geodiff_plugin.types import MetricDepthOutput
@@ -197,24 +178,25 @@ def write_maps(
 ) -> dict[str, Any]:
     """Write every file but exports and the report of the image ``left (H, W, 3)``; counts for the report."""
     depth_m, K = single_map(output.prediction).astype(np.float32), np.asarray(output.K)[0]
-    write_depth_npy(folder / "depth.npy", depth_m)
-    zeros = write_depth_mm(folder / "depth_mm.png", depth_m)
-    depth_figure(depth_m, unit=output.unit).save(folder / "depth.png")
+    formats.write_depth_npy(folder / "depth.npy", depth_m)
+    zeros = formats.write_depth_mm(folder / "depth_mm.png", depth_m)
+    plotting.depth_figure(depth_m, unit=output.unit).save(folder / "depth.png")
     maps = {name: np.asarray(extra)[0] for name, extra in output.extras.items()}
     of_call = {name: getattr(output, name) for name in ("photometric_error", "uncertainty", "confidence")}
     maps |= {name: single_map(value) for name, value in of_call.items() if value is not None}
     for name, values in maps.items():
         np.save(folder / f"{name}.npy", values.astype(np.float32))
-    flying, doubtful, error = flying_points(depth_m), np.zeros(depth_m.shape, dtype=bool), None
+    flying, doubtful, error = formats.flying_points(depth_m), np.zeros(depth_m.shape, dtype=bool), None
     if output.visible is not None:
         visible = single_map(output.visible).astype(bool)
         Image.fromarray(visible.astype(np.uint8) * 255).save(folder / "visible.png")
         error = np.where(visible, maps["photometric_error"], np.nan)
     if output.confidence is not None:
-        share_figure(maps["confidence"], "confidence", 1.0).save(folder / "confidence.png")
+        plotting.share_figure(maps["confidence"], "confidence", 1.0).save(folder / "confidence.png")
         doubtful = maps["confidence"] < min_confidence
-    overview(left, depth_m, maps.get("confidence"), error, output.unit).save(folder / "overview.png")
-    points = write_ply(folder / "cloud.ply", depth_m, left, K, valid=~(flying | doubtful), unit=output.unit)
+    plotting.overview(left, depth_m, maps.get("confidence"), error, output.unit).save(folder / "overview.png")
+    kept = ~(flying | doubtful)
+    points = formats.write_ply(folder / "cloud.ply", depth_m, left, K, valid=kept, unit=output.unit)
     return {
         "depth_mm_zero_pixels": zeros,
         "cloud_points": points,
@@ -245,7 +227,7 @@ def pixels_of(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """What ``make_cloud`` and ``make_mesh`` take: pixels of at least this confidence that do not fly."""
     depth_m = single_map(output.prediction)
-    keep = ~flying_points(depth_m)
+    keep = ~formats.flying_points(depth_m)
     if output.confidence is not None:
         keep &= single_map(output.confidence) >= least_confidence
     return depth_m, left, np.asarray(output.K)[0].astype(np.float64), keep
@@ -256,21 +238,21 @@ def write_exports(folder: Path, output: MetricDepthOutput, inputs: Inputs, optio
     pixels = pixels_of(output, inputs.left, options.min_confidence)
     cameras = cameras_of(output, inputs.guidance)
     if "glb" in options.export:
-        write_glb(folder / "cloud.glb", make_cloud(*pixels), cameras)
+        formats.write_glb(folder / "cloud.glb", formats.make_cloud(*pixels), cameras)
     if "mesh" in options.export:
-        write_glb(folder / "mesh.glb", make_mesh(*pixels), cameras)
+        formats.write_glb(folder / "mesh.glb", formats.make_mesh(*pixels), cameras)
     if "colmap" in options.export:
         names = told_apart(options.photographs().values())
         if inputs.undistorted:
             views = [inputs.left, *(image.permute(1, 2, 0).numpy() for image in inputs.guidance.rights)]
             names = [write_undistorted(folder, image, number) for number, image in enumerate(views, 1)]
         named = [(name, *view) for name, view in zip(names, cameras, strict=True)]
-        write_colmap(folder, named, make_cloud(*pixels))
+        formats.write_colmap(folder, named, formats.make_cloud(*pixels))
 
 
 def _map(path: Path) -> np.ndarray:
     """The map of a frame, left in its file: those of a long video exceed the memory."""
-    file = check_file(path, "FRAME", "a folder of geodiff depth or a .npy")
+    file = formats.check_file(path, "FRAME", "a folder of geodiff depth or a .npy")
     expected = "a depth map (H, W) of floats in metres"
     depth_m = read_npy(file, "FRAME", expected)
     if depth_m.ndim != 2 or depth_m.dtype.kind != "f" or not depth_m.size:
@@ -281,7 +263,7 @@ def _map(path: Path) -> np.ndarray:
 
 def run_video(frames: Sequence[Path], out: Path, fps: float, near: float | None, far: float | None) -> None:
     """Write the video, whose legend is in metres unless a report says that its map has none."""
-    check_video(out, fps)
+    plotting.check_video(out, fps)
     files = [path / "depth.npy" if os.path.isdir(path) else path for path in frames]
     depths_m = [_map(file) for file in files]
     sizes = ["{1}x{0}".format(*depth_m.shape) for depth_m in depths_m]
@@ -290,7 +272,8 @@ def run_video(frames: Sequence[Path], out: Path, fps: float, near: float | None,
             expected = f"all of one shape, {sizes[0]} pixels as {frames[0]}"
             bad_value("FRAME", expected, f"{path} of {size}", "Make a video of each size.")
     metric = all(read_report(file.parent).get("unit", "m") is not None for file in files)
-    write_depth_video(out, depth_frames(depths_m, near=near, far=far, unit="m" if metric else None), fps)
+    pictures = plotting.depth_frames(depths_m, near=near, far=far, unit="m" if metric else None)
+    plotting.write_depth_video(out, pictures, fps)
     print(f"{len(frames)} frames, {len(frames) / fps:.1f} s -> {out}")
 
 
@@ -323,5 +306,5 @@ def run_submit(results: Sequence[Path], to: str, out: Path, method: str) -> None
             place, time = out / "low_res_two_view", f"runtime {time}"
             name, times = f"{scene.name}.pfm", f"{scene.name}.txt"
         write_text(place / times, time)
-        write_pfm(place / name, disparity)
+        formats.write_pfm(place / name, disparity)
     say(f"{out}: {len(folders)} pairs for {to} ({BENCHMARKS[to]})")

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import check_choice
 from geodiff_plugin.algorithm.terms import masked_mean, photometric_map
-from geodiff_plugin.capture.agreement import DepthFrame, seen_in
+from geodiff_plugin.capture.agreement import DepthFrame, rendered
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load, select
 from geodiff_plugin.evaluation.datasets.sample import changed_ref
@@ -31,7 +31,7 @@ from geodiff_plugin.evaluation.options import FigureOptions
 from geodiff_plugin.evaluation.tables import ValueOf, count_of_pairs, grouped, headline, mean_with_interval
 from geodiff_plugin.formats import as_image_01, atomic_path
 from geodiff_plugin.formats.out import write_text
-from geodiff_plugin.geometry import resize_intrinsics, warp_right_to_left
+from geodiff_plugin.geometry import warp_right_to_left
 from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, grid, rasterised, ticks
 from geodiff_plugin.runner import Record
 from geodiff_plugin.scale.space import SPACES, smooth_floor
@@ -229,8 +229,6 @@ def draw_gs_sweep(options: FigureOptions) -> Drawing:
     return figure, {"sample": sample.label} | {name: values.tolist() for name, values in sweep.items()}
 
 
-#: A picture of points is drawn this much smaller than the map that they come from, which closes its holes.
-SHRINK = 0.6
 #: The largest relative error that has a colour of its own.
 WORST_SHOWN = 0.5
 
@@ -246,18 +244,11 @@ def orbit(centre_m: float) -> np.ndarray:
 def render_cloud(
     depth_m: np.ndarray, image: np.ndarray, K: np.ndarray, T_view_from_left: np.ndarray
 ) -> np.ndarray:
-    """Points of a depth map, in the colours of its image, from another camera: uint8, ``SHRINK`` as large."""
-    size = round(depth_m.shape[0] * SHRINK), round(depth_m.shape[1] * SHRINK)
-    K_view = resize_intrinsics(torch.from_numpy(K)[None], depth_m.shape, size)[0].numpy()
-    empty, E_view = np.empty(size), np.linalg.inv(T_view_from_left)
+    """Points of a depth map, in the colours of its image (uint8), as another camera of that K sees them."""
     depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.nan)
-    left, view = DepthFrame("", depth_m, depth_m, K, np.eye(4)), DepthFrame("", empty, empty, K_view, E_view)
-    row, column, z, inside = seen_in(left, view)
-    # Far to near, and a stable sort: the last point written into a pixel is its nearest one.
-    order = np.argsort(-z[inside], kind="stable")
-    picture = np.full((*size, 3), 255, np.uint8)
-    picture[row[inside][order], column[inside][order]] = image[inside][order]
-    return picture
+    view = DepthFrame("", depth_m, depth_m, K, np.linalg.inv(T_view_from_left))
+    seen_m, picture = rendered(DepthFrame("", depth_m, depth_m, K, np.eye(4)), view, image)
+    return np.where(seen_m[..., None] > 0, picture, np.uint8(255))
 
 
 def _answer(

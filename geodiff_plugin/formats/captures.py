@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from geodiff_plugin._checks import InputError, MissingFileError, bad_value
+from geodiff_plugin.formats import sfm
 from geodiff_plugin.formats.files import (
     PathLike,
     natural_order,
@@ -22,14 +23,6 @@ from geodiff_plugin.formats.files import (
 from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.formats.recordings import is_video, video_facts
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, lens_of, reading_whole, resized, rigid
-from geodiff_plugin.formats.sfm import (
-    model_files,
-    nerf_camera,
-    nerf_frames,
-    nerf_pose,
-    read_colmap_model,
-    read_colmap_points,
-)
 from geodiff_plugin.types import Distortion
 
 IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
@@ -160,24 +153,24 @@ def _transforms(path: Path, _: Path | None) -> Found | None:
     if file.suffix != ".json" or not file.is_file():
         return None
     pairs, solved = [], False
-    for name, entries in nerf_frames(read_text(file, "PATH")).items():
+    for name, entries in sfm.nerf_frames(read_text(file, "PATH")).items():
         paths = [file.parent / f"{name}{suffix}" for suffix in ("", *IMAGES)]  # synthetic scenes leave it out
         image = next((path for path in paths if path.is_file()), paths[0])
-        camera = nerf_camera(entries, upright_size(image, f"{image}") if image.is_file() else None)
+        camera = sfm.nerf_camera(entries, upright_size(image, f"{image}") if image.is_file() else None)
         depth = file.parent / entries.get("depth_file_path", f"depth/{image.stem}.png")
-        pairs.append((CaptureFrame(image.stem, image, nerf_pose(entries), depth), camera))
+        pairs.append((CaptureFrame(image.stem, image, sfm.nerf_pose(entries), depth), camera))
         solved |= any(key in entries for key in OF_COLMAP)
     return "transforms.json", None if solved else "m", pairs
 
 
 def _colmap(path: Path, _: Path | None) -> Found | None:
     folders = (path, path / "sparse" / "0", path / "sparse", path / "colmap" / "sparse" / "0")
-    files = next(filter(None, map(model_files, folders)), None)
+    files = next(filter(None, map(sfm.model_files, folders)), None)
     if files is None:
         return None
-    cameras, images, folder = *read_colmap_model(files), files[0].parent
+    cameras, images, folder = *sfm.read_colmap_model(files), files[0].parent
     try:
-        seen = read_colmap_points(folder)
+        seen = sfm.read_colmap_points(folder)
     except MissingFileError:
         seen = {}
     parents = [folder / "images", *(parent / "images" for parent in list(folder.parents)[:3]), folder]

@@ -154,6 +154,11 @@ def test_agreement_averages_within_the_error_marks_what_is_alone_and_outvotes_it
     doubtful = [depth_frame(i, confidence=0.1) for i in (3, 5)]
     np.testing.assert_allclose(agreed(sure, doubtful).depth[hole], wrong.depth[hole], rtol=1e-5)
     np.testing.assert_allclose(agreed(wrong, []).depth, wrong.depth, rtol=1e-6)
+    whole = [depth_frame(i) for i in (3, 5, 6)]
+    half = [replace(f, depth=f.depth[::2, ::2], confidence=f.confidence[::2, ::2]) for f in whole]
+    coarse = [replace(f, K=np.diag([0.5, 0.5, 1.0]) @ K) for f in half]
+    off = np.abs(agreed(wrong, coarse).depth / truth.depth - 1)
+    assert (off[hole] < 0.03).mean() > 0.95, "also between the pixels of coarser frames"
 
 
 @pytest.fixture(scope="module")
@@ -371,8 +376,8 @@ def test_the_command_writes_every_frame_and_goes_on(tmp_path, capsys):
     assert report["poses"]["status"] == "solved" and report["unit"] == "m"
     assert report["agreement"]["f03"]["checked_against"] == 1
     workspace = "images/f03.png stereo/depth_maps/f03.png.geometric.bin sparse/points3D.txt".split()
-    for name in ("cloud.ply", "cloud.glb", "sheet.jpg", *(f"colmap/{file}" for file in workspace)):
-        assert (out / name).is_file()
+    files = ["cloud.ply", "cloud.glb", "sheet.jpg", "video.mp4", *(f"colmap/{file}" for file in workspace)]
+    assert all((out / name).is_file() for name in files)
     made = (out / "f03" / "depth_alone.npy").stat().st_mtime_ns
     assert call(command) == 0 and (out / "f03" / "depth_alone.npy").stat().st_mtime_ns == made
     assert call([*command, "--overwrite"]) == 0
