@@ -53,11 +53,11 @@ def _new_figure(width_in: float, height_in: float) -> Any:
 
 
 def _save_png(picture: Any, path: Path) -> None:
-    """Write a picture whole or not at all, in 256 colours, which are enough and a third of the size."""
+    """Write a picture whole or not at all."""
     image = rasterised(picture) if isinstance(picture, Figure) else picture
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
-        image.quantize(256, dither=Image.Dither.NONE).save(temporary, format="PNG", optimize=True)
+        image.save(temporary, format="PNG", optimize=True)
 
 
 def _style(index: int) -> dict[str, Any]:
