@@ -60,9 +60,9 @@ DIFFERS, ERROR_OF_VOTES = 2.0, 0.1
 #: Reach in which a step is looked for, and that beyond which it must not go on as a slope, pixels; the least
 #: step in log depth, and how much larger it may be within the wider reach.
 NEARBY, WIDE, EDGE, RISE = 4, 12, 0.1, 2.2
-#: Share of a step between two pixels that is crisp, and the least that is told apart; power with which a soft
-#: map raises the error of its prior at edges, and up to which error.
-CRISP, LEAST_CRISP, SOFT, MOST_SOFT = 0.8, 0.1, 4.0, 0.14
+#: Pixels that a crisp step takes, the share of the step within them, and the least share that is told apart;
+#: power with which a soft map raises the error of its prior at edges, and up to which error.
+STEP_PX, CRISP, LEAST_CRISP, SOFT, MOST_SOFT = 2, 0.8, 0.1, 4.0, 0.14
 #: Votes within about this many pixels of the median make the mean.
 NEAR_PX = 1.0
 #: Side of the last median filter, pixels of the voting grid.
@@ -209,16 +209,16 @@ def _resized(image_01: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _crispness(depth_m: Tensor) -> Tensor:
-    """``()`` in (0, 1]: the share of a step in a map ``(H, W)`` that lies between two pixels; 1 is crisp.
+    """``()`` in (0, 1]: the share of a step in a map ``(H, W)`` that ``STEP_PX`` pixels take; 1 is crisp.
 
     The median over edges: pixels inside with a step nearby that is not the slope of a wide surface.
     """
     log_depth = depth_m.clamp_min(1e-9).log()[None, None]
-    across, down = (log_depth.diff(dim=axis).abs() for axis in (-1, -2))
-    step = torch.maximum(F.pad(across, (1, 0)), F.pad(down, (0, 0, 1, 0)))
+    across, down = ((log_depth - log_depth.roll(STEP_PX, axis)).abs() for axis in (-1, -2))
     near, wide = (highest(log_depth, reach) + highest(-log_depth, reach) for reach in (NEARBY, WIDE))
     at_edge = (near > EDGE) & (wide < RISE * near)
-    share = torch.where(at_edge, highest(step, NEARBY) / near, torch.nan)[..., WIDE:-WIDE, WIDE:-WIDE]
+    step = highest(torch.maximum(across, down), NEARBY)
+    share = torch.where(at_edge, step / near, torch.nan)[..., WIDE:-WIDE, WIDE:-WIDE]
     return (share.flatten().nanmedian().nan_to_num(1.0) / CRISP).clamp(LEAST_CRISP, 1.0)
 
 

@@ -16,7 +16,6 @@ import torch
 import torch.nn.functional as F
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import check_choice
