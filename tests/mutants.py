@@ -229,7 +229,7 @@ MUTANTS = [
         ("clamp_min(1.0) ** 3", "clamp_min(1.0) ** 2"),
         ("DIFFERS, ERROR_OF_VOTES = 2.0, 0.1", "DIFFERS, ERROR_OF_VOTES = 1.5, 0.1"),
         ("STEEPER = 2.0", "STEEPER = 1.0"),
-        ("CRISP, LEAST_CRISP, SOFT, MOST_SOFT = 0.8", "CRISP, LEAST_CRISP, SOFT, MOST_SOFT = 0.7"),
+        ("SOFT, MOST_SOFT = 2", "SOFT, MOST_SOFT = 3"),
         ("(error / _crispness(small_m) ** SOFT)", "error"),
         ("[..., WIDE:-WIDE, WIDE:-WIDE]", ""),
         tests=(f"{UNIT}algorithm.py",),
