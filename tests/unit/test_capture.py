@@ -131,9 +131,10 @@ def test_frames_of_nothing_in_common_are_refused():
     assert all(i < j for i, j in pairs) and len(pairs) == len(set(pairs))
 
 
-def depth_frame(i: int, factor: float = 1.0, confidence: float = 0.6) -> DepthFrame:
-    depth = render(TRUE[i])[1].astype(np.float32)
-    return DepthFrame(f"f{i}", depth * np.float32(factor), np.full_like(depth, confidence), K, TRUE[i])
+def depth_frame(i: int, factor: float = 1.0, confidence: float = 0.6, every: int = 1) -> DepthFrame:
+    depth = np.float32(factor) * render(TRUE[i])[1].astype(np.float32)[::every, ::every]
+    K_here = np.diag([1 / every, 1 / every, 1.0]) @ K
+    return DepthFrame(f"f{i}", depth, np.full_like(depth, confidence), K_here, TRUE[i])
 
 
 def test_agreement_averages_within_the_error_marks_what_is_alone_and_outvotes_it():
@@ -154,9 +155,7 @@ def test_agreement_averages_within_the_error_marks_what_is_alone_and_outvotes_it
     doubtful = [depth_frame(i, confidence=0.1) for i in (3, 5)]
     np.testing.assert_allclose(agreed(sure, doubtful).depth[hole], wrong.depth[hole], rtol=1e-5)
     np.testing.assert_allclose(agreed(wrong, []).depth, wrong.depth, rtol=1e-6)
-    whole = [depth_frame(i) for i in (3, 5, 6)]
-    half = [replace(f, depth=f.depth[::2, ::2], confidence=f.confidence[::2, ::2]) for f in whole]
-    coarse = [replace(f, K=np.diag([0.5, 0.5, 1.0]) @ K) for f in half]
+    coarse = [depth_frame(i, every=2) for i in (3, 5, 6)]
     off = np.abs(agreed(wrong, coarse).depth / truth.depth - 1)
     assert (off[hole] < 0.03).mean() > 0.95, "also between the pixels of coarser frames"
 
