@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import filecmp
+import gc
 import re
 import sys
 import tempfile
@@ -19,24 +21,9 @@ import gradio as gr
 import numpy as np
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.app import look
+from geodiff_plugin.app import look, results
 from geodiff_plugin.app.form import EXAMPLES, QUICK, Form, build_form
 from geodiff_plugin.app.job import Priors, Stopped, run_job
-from geodiff_plugin.app.results import (
-    NAMES,
-    SCENE,
-    K_of,
-    Pixels,
-    depth_of,
-    files_of,
-    legend_of_confidence,
-    legend_of_depth,
-    map_of,
-    measurement,
-    picture,
-    scale_of,
-    write_scene,
-)
 from geodiff_plugin.cli.depth import Job
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.outputs import depth_summary
@@ -69,7 +56,22 @@ THEME = gr.themes.Base(
 
 
 def _forget(job: Job | None) -> None:
-    _delete([] if job is None else [job.folder.path])
+    """Delete a result's files, and what it has in memory: gradio keeps the states of closed tabs a while."""
+    if job is not None:
+        _delete([job.folder.path])
+        for name in ("inputs", "output"):
+            vars(job).pop(name, None)
+        gc.collect()
+        if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)):
+            trim(0)  # else glibc keeps freed memory, more of it after every job
+
+
+def _kept(job: Job, ended: threading.Event) -> Job:
+    """The job, unless its visitor stopped it or left during its last stage."""
+    if ended.is_set():
+        _forget(job)
+        raise Stopped
+    return job
 
 
 def _uploads(options: DepthOptions) -> set[Path]:
@@ -105,8 +107,8 @@ def _sentence(error: Exception) -> str:
 
 def _figures(job: Job) -> list[tuple[str, str]]:
     """Numbers for the banner; of a result that is not trusted only what is there, not how good it is."""
-    visible, confidence = map_of(job, "visible"), map_of(job, "confidence")
-    depth = depth_summary(depth_of(job), visible)
+    visible, confidence = results.map_of(job, "visible"), results.map_of(job, "confidence")
+    depth = depth_summary(results.depth_of(job), visible)
     seconds = (f"{sum(job.watch.seconds.values()):.1f} s", "computing")
     if not job.output.verdict.trusted:
         return [(f"{depth['median_m']:.2f} m, unconfirmed", "median depth"), seconds]
@@ -123,7 +125,7 @@ def _figures(job: Job) -> list[tuple[str, str]]:
 
 def _cameras(job: Job) -> str:
     """The cameras as understood."""
-    (fx, _, cx), (_, fy, cy), _ = K_of(job)
+    (fx, _, cx), (_, fy, cy), _ = results.K_of(job)
     x, y, z = apart = job.inputs.guidance.rigs[0].E[:3, 3]
     ways = {"right": x, "left": -x, "below": y, "above": -y, "before": z, "behind": -z}
     way, away = max(ways, key=lambda side: ways[side]), np.linalg.norm(apart)
@@ -136,19 +138,19 @@ def _everything(panels: SimpleNamespace, job: Job, opened: str) -> dict[Any, Any
     verdict = job.output.verdict
     sentences = dict.fromkeys([*verdict.reasons, *job.warnings])
     told = [for_visitors(sentence) for sentence in sentences if sentence != verdict.sentence]
-    marked, words = measurement(job, [])
-    sure = picture(job, "confidence")
+    marked, words = results.measurement(job, [])
+    sure = results.picture(job, "confidence")
     shown = {
         panels.status: look.finished(verdict.status, _figures(job), told, _cameras(job)),
         panels.measure_verdict: look.banner(verdict.status),
         panels.files_verdict: look.banner(verdict.status),
-        panels.slider: (picture(job, "photograph"), picture(job, "depth")),
-        panels.depth_legend: legend_of_depth(depth_of(job)),
+        panels.slider: (results.picture(job, "photograph"), results.picture(job, "depth")),
+        panels.depth_legend: results.legend_of_depth(results.depth_of(job)),
         panels.picture: marked,
         panels.readings: words,
-        panels.files: [str(path) for path in files_of(job)],
+        panels.files: [str(path) for path in results.files_of(job)],
         panels.confidence: sure,
-        panels.confidence_legend: "" if sure is None else legend_of_confidence(),
+        panels.confidence_legend: "" if sure is None else results.legend_of_confidence(),
     }
     if opened == CLOUD_TAB:
         shown[panels.scene], shown[panels.points] = _scene(job)
@@ -157,8 +159,8 @@ def _everything(panels: SimpleNamespace, job: Job, opened: str) -> dict[Any, Any
 
 def _scene(job: Job) -> tuple[Any, str]:
     """The view of the cloud of confident points from behind the cameras, and a line about it."""
-    path, depth_m = job.folder.path / SCENE, depth_of(job)
-    count = write_scene(path, job, LEAST_CONFIDENCE)
+    path, depth_m = job.folder.path / results.SCENE, results.depth_of(job)
+    count = results.write_scene(path, job, LEAST_CONFIDENCE)
     share, away = 100 * count / depth_m.size, VIEW_FROM * float(np.percentile(depth_m, 90))
     view = gr.Model3D(str(path), camera_position=(*VIEW_ANGLES, away))
     return view, f'<div class="legend-caption">{count:,} points, {share:.0f} % of the pixels</div>'
@@ -169,9 +171,9 @@ def _wire_run(
 ) -> Callable[[gr.Request], Any]:
     """Everything from the run to its result; what happens when a visitor leaves."""
     fields, turn = list(form.fields.values()), threading.Lock()  # one job runs at a time
-    # By session; a call over the API may have none. Folders are of uploads and results.
+    # By session; a call over the API may have none.
     stops = defaultdict[str | None, threading.Event](threading.Event)
-    folders = defaultdict[str | None, set[Path]](set)
+    uploads, jobs = defaultdict[str | None, set[Path]](set), dict[str | None, Job]()
     fixed = (panels.tabs, panels.pixel, panels.add, panels.clear)
     shows = [component for component in vars(panels).values() if component not in fixed]
 
@@ -186,7 +188,8 @@ def _wire_run(
     def leave(request: gr.Request) -> None:
         stop(request)
         stops.pop(request.session_hash)
-        _delete(folders.pop(request.session_hash, set()).difference(*folders.values()))
+        _delete(uploads.pop(request.session_hash, set()).difference(*uploads.values()))
+        _forget(jobs.pop(request.session_hash, None))
 
     def nothing(status: str) -> dict[Any, Any]:
         """No result, and why."""
@@ -200,13 +203,11 @@ def _wire_run(
     ) -> dict[Any, Any]:
         """Depth in metres of the left photograph, with its files."""
         (*filled, before, opened), visitor = values, request.session_hash
-        _forget(before)
         try:
             wanted, ended = form.options(tuple(filled)), stops[visitor]
-            folders[visitor] |= _uploads(wanted)
+            uploads[visitor] |= _uploads(wanted)
             with turn:
-                job = run_job(wanted, priors, ended, progress)
-            folders[visitor].add(job.folder.path)
+                job = jobs[visitor] = _kept(run_job(wanted, priors, ended, progress), ended)
             return {state: job, points: [], **_everything(panels, job, opened)}
         except Stopped:
             return nothing(look.STOPPED)
@@ -214,6 +215,7 @@ def _wire_run(
             return nothing(look.failed(_sentence(error)))
         finally:
             stops.pop(visitor, None)
+            _forget(before)
 
     def take(event: gr.SelectData) -> list[Any]:
         return form.example(int(event.index))
@@ -238,29 +240,29 @@ def _wire_run(
 
 
 def _wire_panels(panels: SimpleNamespace, state: gr.State, points: gr.State, tab: gr.State) -> None:
-    def redraw(job: Job | None, pixels: Pixels) -> tuple[Any, ...]:
+    def redraw(job: Job | None, pixels: results.Pixels) -> tuple[Any, ...]:
         if job is None:
             return gr.skip(), gr.skip(), gr.skip()
-        return pixels, *measurement(job, pixels)
+        return pixels, *results.measurement(job, pixels)
 
-    def click(job: Job | None, pixels: Pixels, event: gr.SelectData) -> tuple[Any, ...]:
-        return redraw(job, [*pixels, tuple(event.index)][-len(NAMES) :])
+    def click(job: Job | None, pixels: results.Pixels, event: gr.SelectData) -> tuple[Any, ...]:
+        return redraw(job, [*pixels, tuple(event.index)][-len(results.NAMES) :])
 
-    def add(job: Job | None, pixels: Pixels, typed: str) -> tuple[Any, ...]:
+    def add(job: Job | None, pixels: results.Pixels, typed: str) -> tuple[Any, ...]:
         numbers = [int(word) for word in re.findall(r"\d{1,6}", typed or "")]
         if job is None or len(numbers) != 2:
             return gr.skip(), gr.skip(), "Type two whole numbers: x, y." if job else gr.skip()
-        x, y = (round(number * scale_of(job)) for number in numbers)
-        return redraw(job, [*pixels, (x, y)][-len(NAMES) :])
+        x, y = (round(number * results.scale_of(job)) for number in numbers)
+        return redraw(job, [*pixels, (x, y)][-len(results.NAMES) :])
 
-    def turn(job: Job | None, pixels: Pixels, event: gr.SelectData) -> dict[Any, Any]:
+    def turn(job: Job | None, pixels: results.Pixels, event: gr.SelectData) -> dict[Any, Any]:
         """What is made when its tab is opened."""
         shown: dict[Any, Any] = {tab: event.value}
         if job is not None and event.value == CLOUD_TAB:
             # A 3D view that gets its file while it is hidden stays empty (gradio 6.31).
             shown[panels.scene], shown[panels.points] = _scene(job)
         elif job is not None and event.value == FILES_TAB:  # with what was measured
-            shown[panels.files] = [str(path) for path in files_of(job, pixels)]
+            shown[panels.files] = [str(path) for path in results.files_of(job, pixels)]
         return shown
 
     measured = [points, panels.picture, panels.readings]

@@ -5,6 +5,7 @@ import gc
 import json
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 from zipfile import ZipFile
 
 import numpy as np
@@ -13,20 +14,8 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import enable_geometry_guidance
-from geodiff_plugin.app import job, launch
+from geodiff_plugin.app import job, launch, results
 from geodiff_plugin.app.job import Priors, Stopped, options_of, run_job
-from geodiff_plugin.app.results import (
-    depth_of,
-    distance_m,
-    files_of,
-    legend_of_confidence,
-    legend_of_depth,
-    map_of,
-    measurement,
-    metres,
-    read_pixel,
-    reading,
-)
 from geodiff_plugin.formats import read_calibration, read_image
 
 K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
@@ -34,35 +23,36 @@ DEPTH = np.full((48, 64), 2.0, np.float32)
 
 
 def test_a_point_is_where_its_ray_ends():
-    reading = read_pixel(DEPTH, K, (61, 23))
-    np.testing.assert_allclose(reading.point_m, [2 * 29.5 / 60, -0.5 / 30, 2])
-    assert reading.depth_m == 2 and reading.spread is None and reading.confidence is None
-    a, b = (read_pixel(DEPTH, K, pixel) for pixel in ((1, 10), (61, 10)))
-    assert distance_m(a, b) == (pytest.approx(2.0), None)
+    at = results.read_pixel(DEPTH, K, (61, 23))
+    np.testing.assert_allclose(at.point_m, [2 * 29.5 / 60, -0.5 / 30, 2])
+    assert at.depth_m == 2 and at.spread is None and at.confidence is None
+    a, b = (results.read_pixel(DEPTH, K, pixel) for pixel in ((1, 10), (61, 10)))
+    assert results.distance_m(a, b) == (pytest.approx(2.0), None)
     with pytest.raises(ValueError, match="inside the map of 64x48"):
-        read_pixel(DEPTH, K, (64, 0))
+        results.read_pixel(DEPTH, K, (64, 0))
 
 
 def test_spread_is_that_of_a_normal_error_with_this_confidence():
-    reading = read_pixel(DEPTH, K, (3, 4), np.full((48, 64), 0.6827))
-    assert reading.spread == pytest.approx(0.1, rel=1e-3)  # one standard deviation holds 68.27 %
+    at = results.read_pixel(DEPTH, K, (3, 4), np.full((48, 64), 0.6827))
+    assert at.spread == pytest.approx(0.1, rel=1e-3)  # one standard deviation holds 68.27 %
     sure, wide = np.full((48, 64), 0.999), np.full((48, 64), 0.5)
-    assert read_pixel(DEPTH, K, (0, 0), sure, wide).spread_m == pytest.approx(1.4826 * 0.5), "the larger"
-    assert metres(2.314) == "2.31 m" and metres(2.314, 0.07) == "2.31 ± 0.07 m"
-    assert metres(0.3141, 0.002) == "0.314 ± 0.002 m"
+    at = results.read_pixel(DEPTH, K, (0, 0), sure, wide)
+    assert at.spread_m == pytest.approx(1.4826 * 0.5), "the larger"
+    assert results.metres(2.314) == "2.31 m" and results.metres(2.314, 0.07) == "2.31 ± 0.07 m"
+    assert results.metres(0.3141, 0.002) == "0.314 ± 0.002 m"
 
 
 def test_spread_of_a_distance_agrees_with_drawn_errors():
     depth_m, confidence = DEPTH.copy(), np.full((48, 64), 0.9)
     depth_m[:, 32:] = 3.0
-    a, b = (read_pixel(depth_m, K, pixel, confidence) for pixel in ((10, 10), (50, 40)))
+    a, b = (results.read_pixel(depth_m, K, pixel, confidence) for pixel in ((10, 10), (50, 40)))
     rng = np.random.default_rng(0)
     drawn = [
         np.linalg.norm(b.point_m * (1 + b.spread * eb) - a.point_m * (1 + a.spread * ea))
         for ea, eb in rng.normal(size=(20_000, 2)) * 0.1  # a tenth: where the distance is linear in them
     ]
-    assert distance_m(a, b)[1] == pytest.approx(10 * np.std(drawn), rel=0.03)
-    length, spread = distance_m(a, a)
+    assert results.distance_m(a, b)[1] == pytest.approx(10 * np.std(drawn), rel=0.03)
+    length, spread = results.distance_m(a, a)
     assert length == 0 and spread > 0
 
 
@@ -148,33 +138,33 @@ def result(priors, asked):
 
 
 def test_a_job_and_its_files(result):
-    assert depth_of(result).shape == map_of(result, "uncertainty").shape == (48, 64)
-    paths = files_of(result)
+    assert results.depth_of(result).shape == results.map_of(result, "uncertainty").shape == (48, 64)
+    paths = results.files_of(result)
     names, folder = [path.name for path in paths], paths[0].parent
     assert names[:3] == ["everything.zip", "depth_mm.png", "depth.npy"] and "confidence.npy" in names
     assert sorted(ZipFile(paths[0]).namelist()) == sorted(names[1:])
-    np.testing.assert_array_equal(np.load(folder / "depth.npy"), depth_of(result))
+    np.testing.assert_array_equal(np.load(folder / "depth.npy"), results.depth_of(result))
     report = json.loads((folder / "report.json").read_text())
     assert report["inputs"]["E"][0][3] == pytest.approx(0.12) and report["arguments"]["left"] == "left.png"
     assert report["arguments"]["ensemble"] == 2 and "cx is assumed" in " ".join(report["warnings"])
     assert report["verdict"]["status"] == result.output.verdict.status
     pixels = [(5, 5), (50, 40), (20, 20)]
-    with ZipFile(files_of(result, pixels)[0]) as archive:  # which does not hold itself
+    with ZipFile(results.files_of(result, pixels)[0]) as archive:  # which does not hold itself
         assert sorted(archive.namelist()) == sorted([*names[1:], "measurements.csv"])
         header, *rows = archive.read("measurements.csv").decode().splitlines()
     assert header.startswith("name,x_px") and rows[0].startswith("A,5,5,")
     assert [row.split(",")[0] for row in rows] == ["A", "B", "C", "A to B"]
-    length = distance_m(*(reading(result, pixel) for pixel in pixels[:2]))[0]
+    length = results.distance_m(*(results.reading(result, pixel) for pixel in pixels[:2]))[0]
     assert float(rows[3].split(",")[-1]) == pytest.approx(length, abs=1e-3)
-    assert [path.name for path in files_of(result)] == names, "nothing is measured"
+    assert [path.name for path in results.files_of(result)] == names, "nothing is measured"
 
 
 def test_points_are_marked_where_they_were_clicked_and_told_in_words(result):
-    picture, words = measurement(result, [(5, 5), (50, 40), (20, 20)])
+    picture, words = results.measurement(result, [(5, 5), (50, 40), (20, 20)])
     assert picture.shape == (48, 64, 3) and "Distance A to B" in words and "second point" in words
     assert picture[5, 5].tolist() == picture[40, 50].tolist() == [0xC2, 0x41, 0x0C]
-    assert ">5 m</span>" in legend_of_depth(np.geomspace(1, 10, 1000).reshape(20, 50))
-    assert ">50 %</span>" in legend_of_confidence()
+    assert ">5 m</span>" in results.legend_of_depth(np.geomspace(1, 10, 1000).reshape(20, 50))
+    assert ">50 %</span>" in results.legend_of_confidence()
 
 
 def test_a_stop_ends_a_job_between_steps(priors, asked):
@@ -268,6 +258,14 @@ class TestWithGradio:
         said = "LEFT must be an image; got /tmp/x/left.png. Give --fx, or widen depth_range (--near, --far)."
         told = "the left photograph must be an image; got left.png. Give fx, or widen depth_range."
         assert for_visitors(said) == told
+
+    def test_a_forgotten_result_leaves_no_files_and_no_maps(self, tmp_path):
+        from geodiff_plugin.app.page import _forget
+
+        result = SimpleNamespace(folder=SimpleNamespace(path=tmp_path), inputs=[], output=[])
+        for _ in range(2):  # when the tab is closed, and by gradio later
+            _forget(result)
+        assert not tmp_path.exists() and list(vars(result)) == ["folder"]
 
     def test_a_port_that_another_program_has_is_a_sentence(self, monkeypatch):
         def taken(*_args, **_options):
