@@ -154,14 +154,16 @@ def vote_depth(
     views: Sequence[CameraView],
     target: Matches,
     error: Tensor,
+    spacing: float = 1.0,
 ) -> Tensor:
     """Give every pixel the depth voted by the map and by the matches around it that have its colour.
 
     The weighted median of the votes chooses a surface; the mean of those near it is the depth. Rows of a
     rectified view are matched again at this resolution, for edges that the sweep's grid cannot resolve;
     without a rectified view the map is returned unchanged. ``depth_m (1, 1, H, W)`` is fitted to the matches;
-    left image, K and views are native; the prior's ``error (1, 1, 1, 1)`` decides how much contradicting
-    matches, and the map itself, count. The result stays within the range of ``depth_m``.
+    left image, K and views are native; the prior's ``error (1, 1, 1, 1)``, and its ``spacing`` as in
+    ``sharpen_edges``, decide how much contradicting matches, and the map itself, count. The result stays
+    within the range of ``depth_m``.
     """
     native = image_size(left_01)
     rectified = [v for v in views if is_rectified(K_left, v.K, v.T_right_from_left)]
@@ -185,7 +187,8 @@ def vote_depth(
         left[0], CameraView(right[0], K_right, view.T_right_from_left), K, float(nearest)
     )
     error = error.flatten()[0].clamp_min(1e-3)
-    error = torch.maximum(error, (error / _crispness(small_m) ** SOFT).clamp_max(MOST_SOFT))
+    crispness = _crispness(small_m) / max(1.0, share * spacing / STEP_PX)  # a coarse grid places no edge well
+    error = torch.maximum(error, (error / crispness**SOFT).clamp_max(MOST_SOFT))
     # The confidence of a known point is a count.
     votes = (
         _weigh_votes(of_rows, ROWS * matched + FILLED * filled, shift, error),

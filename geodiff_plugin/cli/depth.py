@@ -16,15 +16,9 @@ import torch
 
 from geodiff_plugin._checks import bad_value, noted, warn
 from geodiff_plugin.bundled import no_bars
+from geodiff_plugin.cli import outputs
 from geodiff_plugin.cli.inputs import Inputs, read_inputs
 from geodiff_plugin.cli.options import DepthOptions, told_apart
-from geodiff_plugin.cli.outputs import (
-    build_report,
-    summary_line,
-    write_exports,
-    write_maps,
-    write_undistorted,
-)
 from geodiff_plugin.cli.terminal import StopWatch, collected_warnings, say
 from geodiff_plugin.formats.out import REPORT, OutFolder
 from geodiff_plugin.formats.sfm import check_colmap_names
@@ -107,15 +101,15 @@ class Job:
     def write(self, pipe: Any) -> dict[str, Any]:
         """Fill the folder: every map, what ``--export`` asks for, and last the report, which is returned."""
         options, inputs, output = self.options, self.inputs, self.output
-        report = build_report(inputs, output, pipe, options, self.warnings) | self.entries
+        report = outputs.build_report(inputs, output, pipe, options, self.warnings) | self.entries
 
         def fill(folder: Path) -> None:
             with self.watch.stage("write"):
-                report["files"] = write_maps(folder, output, inputs.left, options.min_confidence)
+                report["files"] = outputs.write_maps(folder, output, inputs.left, options.min_confidence)
                 if inputs.undistorted:
-                    write_undistorted(folder, inputs.left)
+                    outputs.write_undistorted(folder, inputs.left)
                 if options.export:
-                    write_exports(folder, output, inputs, options)
+                    outputs.write_exports(folder, output, inputs, options)
             report["files"]["names"] = [*sorted(path.name for path in folder.iterdir()), REPORT]
             report["seconds"] = {stage: round(seconds, 3) for stage, seconds in self.watch.seconds.items()}
             (folder / REPORT).write_text(_text(report) + "\n", encoding="utf-8")
@@ -151,4 +145,4 @@ def run_depth(options: DepthOptions, folder: OutFolder, watch: StopWatch) -> Non
     if options.json:
         print(_text(report))
     elif not options.quiet:
-        print(summary_line(report, f"{folder.path}/"))
+        print(outputs.summary_line(report, f"{folder.path}/"))

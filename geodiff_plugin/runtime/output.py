@@ -44,9 +44,9 @@ def _finish(
     """
     evidence, (kept, error) = run.evidence[image], run.kept_and_error(image, member)
     matches, points = Matches.stack([evidence.matches]), Matches.stack([evidence.points])
+    spacing = max(image_size(depth_m)) / max(run.grid.content)
     if matches is not None or points is not None:
-        spacing = max(1, round(max(image_size(depth_m)) / max(run.grid.content)))
-        depth_m = sharpen_edges(depth_m, left, spacing)
+        depth_m = sharpen_edges(depth_m, left, max(1, round(spacing)))
     target = correction_target(matches, points, kept, error, depth_m)
     if target is None or error is None:
         return None
@@ -57,7 +57,7 @@ def _finish(
         assert target is not None  # there are matches
         K = resize_intrinsics(evidence.K_left[None], image_size(evidence.left_01), image_size(native))[0]
         measured = error.amin((2, 3), keepdim=True)  # its value where the prior gives a depth
-        fitted_m = vote_depth(fitted_m, native, K, evidence.native_views, target, measured)
+        fitted_m = vote_depth(fitted_m, native, K, evidence.native_views, target, measured, spacing)
     return fitted_m, support
 
 
