@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from geodiff_plugin import plotting
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import InputFileError, bad_value, warn
 from geodiff_plugin.capture.agreement import DepthFrame, agreed, scene_poses, steadied
 from geodiff_plugin.capture.capture import Capture, choose_neighbours
 from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb, write_vertices
@@ -159,7 +159,10 @@ def _video(capture: Capture, out: Path, names: Sequence[str]) -> None:
             halves = _pixels(capture, name), plotting.colour_depth(depth, near, far)
             yield ImageOps.pad(Image.fromarray(np.hstack(halves)), VIDEO_SIZE)
 
-    plotting.write_depth_video(out / "video.mp4", frames(), VIDEO_FPS)
+    try:
+        plotting.write_depth_video(out / "video.mp4", frames(), VIDEO_FPS)
+    except InputFileError as error:  # an OpenCV without codecs; everything else is there
+        warn(str(error))
 
 
 def normals_of(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
