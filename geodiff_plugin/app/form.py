@@ -114,7 +114,7 @@ def _views() -> dict[str, Any]:
     with gr.Column(visible=False) as lens, gr.Row():
         for name, placeholder in (("fx", "focal"), ("fy", "as fx"), ("cx", "middle"), ("cy", "middle")):
             drawn[name] = _optional(name, placeholder)
-    note = "cx + doffs; if it is not cx and left empty, every depth is off"
+    note = "cx + doffs; empty means the same cx as left"
     cx_right = _optional("cx_right", "assumed as cx", info=note, visible=False)
     drawn["cx_right"] = cx_right
     drawn["baseline"] = _optional("baseline", "as the calibration file says")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 HEADER = """
 <div class="head">
   <h1>Depth in metres from two photographs</h1>
-  <p>A diffusion model knows shapes, a second view with a known camera knows metres.
+  <p>A diffusion model gives the shape, a second view with a known camera the metres.
   Drop both photographs, say where the cameras are, and measure. What you give is deleted after ten
   minutes.</p>
 </div>

@@ -73,8 +73,8 @@ def seen_in(frame: DepthFrame, other: DepthFrame) -> Maps:
 def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False) -> DepthFrame:
     """A frame, with its depth averaged with that of others where they agree, ``confirmed`` and ``asked``.
 
-    A depth that no other frame confirms gives way to one on which several others agree and which together
-    count more; where things may be ``moving``, only if its confidence is low. Inverse depths are averaged; a
+    A depth that no other frame confirms gives way to a depth on which several others agree with more
+    weight; where things may be ``moving``, only if its confidence is low. Inverse depths are averaged; a
     median smooths them around what others replace.
 
     Source: Merrell et al. 2007, S4: depth maps rendered into one view, supported by those that agree.
@@ -117,9 +117,9 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False
 
 
 def _depth_by(other: DepthFrame, frame: DepthFrame) -> Maps:
-    """What another frame says of every pixel of a frame, at the point where that puts it, ``(H, W)`` each.
+    """What another frame says of the point that each pixel of a frame shows, ``(H, W)`` each.
 
-    Its depth in the frame's view, its confidence, whether it sees the point, whether both mean the same one.
+    Its depth in the frame's view, its confidence, whether it sees the point, whether both depths agree.
     """
     row, column, z, seen = seen_in(frame, other)
     there = other.depth[row, column].astype(np.float64)
@@ -127,7 +127,7 @@ def _depth_by(other: DepthFrame, frame: DepthFrame) -> Maps:
     rays = np.stack([column, row, np.ones_like(row)], -1) @ np.linalg.inv(other.K).T
     points = (rays * there[..., None]) @ moved[:3, :3].T + moved[:3, 3]
     depth = np.where(np.abs(points[..., 2]) < 1e-6, 1e-6, points[..., 2])
-    # Its own pixel lies up to half a pixel beside the point, which moves it here: only depth counts then.
+    # The nearest pixel lies up to half a pixel beside the point, so only depths are compared.
     same = seen & (np.abs(there / z - 1) < SAME_SHARE) & (np.abs(depth / frame.depth - 1) < SAME_SHARE)
     # A point behind what the other frame sees is hidden from it, which says nothing against ours.
     return depth, other.confidence[row, column], seen & (there > (1 - SAME_SHARE) * z), same

@@ -265,8 +265,8 @@ def choose_neighbours(
 ) -> list[int]:
     """Numbers of at most ``most`` neighbours of a frame, the best first, ``among`` those given if any are.
 
-    Every shared point counts by the angle of its two rays, and less where earlier neighbours see it: so they
-    together see all of the frame. Those nearest by position where the frame shares no points.
+    Every shared point counts by the angle of its two rays, and less where earlier neighbours see it, so that
+    together they see the whole frame. Without shared points: the frames nearest in order.
 
     Source: Yao et al. 2018 (MVSNet), S5.1: the piecewise Gaussian of the angle.
     """

@@ -41,14 +41,14 @@ VERTEX = (*"xyz", "nx", "ny", "nz", "red", "green", "blue")
 
 
 def _frame(capture: Capture, out: Path, maps: Sequence[str], name: str) -> DepthFrame:
-    """A frame of a run, read when it is asked for: those of a long capture exceed the memory."""
+    """A frame of a run, read on demand: all frames of a long capture exceed the memory."""
     depth, confidence, *more = (np.load(out / name / f"{file}.npy") for file in maps)
     solved, i = capture.solve(), capture.names.index(name)
     return DepthFrame(name, depth, confidence, solved.K[i], solved.E[i], *more)
 
 
 def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Write what finished frames agree on with those that see the same; shares of their pixels by frame."""
+    """Check finished frames against those that see the same, and write the result; pixel shares by frame."""
     solved, number = capture.solve(), {name: i for i, name in enumerate(capture.names)}
     there, shares = {number[name] for name in names}, {}
     load = lru_cache(maxsize=2 * OTHERS)(partial(_frame, capture, out, ALONE))

@@ -137,7 +137,7 @@ class _Convert:
         metavar="SRC DST | marigold-v2 BASE CHECKPOINT DST",
     )
     part: str | None = declare(None, "File, folder or hub id of what SRC lacks (priors.md).", "--with")
-    space: str | None = declare(None, "marigold-v2: as for geodiff info.", choices=SPACES)
+    space: str | None = declare(None, "marigold-v2: space of its map.", choices=SPACES)
 
 
 COMMANDS = {

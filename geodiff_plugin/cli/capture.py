@@ -62,9 +62,9 @@ def open_capture(options: CaptureOptions) -> Capture:
 
 
 def solved_poses(capture: Capture, options: CaptureOptions, factor: float | None = None) -> float | None:
-    """Solve for the poses, or take those that an earlier run of the same capture left; then set the scale.
+    """Solve for the poses, or load those of an earlier run of the same capture; then set the scale.
 
-    That is the ``factor`` that another process found and returned, metres per unit of the poses.
+    Returns metres per unit of the poses; ``factor`` passes in what another process found.
     """
     path, key = options.out / POSES_FILE, _key(capture, options, *OF_POSES)
     solved = None if options.overwrite else load_solved(path, key)

@@ -24,7 +24,7 @@ APPEARANCE: dict[str, Any] = {
 
 
 class Command(NamedTuple):
-    """A command: its options, what is called with them (of a group without: returns it), and what it does."""
+    """A command: its options (``None`` for a group, which ``run`` returns), its function and its help."""
 
     options: type | None
     run: Callable[[Any], Any]

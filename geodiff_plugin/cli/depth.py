@@ -125,7 +125,7 @@ def _text(report: dict[str, Any]) -> str:
 def estimate_and_write(
     options: DepthOptions, folder: OutFolder, watch: StopWatch
 ) -> tuple[Any, Job, dict[str, Any]]:
-    """Everything of ``geodiff depth`` on what ``start_pair`` gave but its answer: pipeline, job, report."""
+    """Run ``geodiff depth`` in the folder of ``start_pair``, without printing; pipeline, job and report."""
     job = Job(options, folder, watch)
     with collected_warnings():
         device = pick_device(options.device)

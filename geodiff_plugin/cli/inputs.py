@@ -163,7 +163,7 @@ def _intrinsics(options: DepthOptions, way: str, path: Path, i: int, size: Size)
 
 
 def _known_length(options: DepthOptions, K: np.ndarray, lens: Distortion | None) -> tuple[float, ...] | None:
-    """``X1,Y1,X2,Y2,METRES`` as typed, its ends where the image without lens distortion has them."""
+    """``X1,Y1,X2,Y2,METRES`` as typed, its ends moved to the image without lens distortion."""
     if options.known_length is None:
         return None
     try:
@@ -228,7 +228,7 @@ def lenses_of(options: DepthOptions, rig: Rig | None = None) -> tuple[Distortion
         cure = "A view with a K of its own has a lens of its own: 0,0,0,0 says that it is straight."
         bad_value("--view-distortion", "given for each --view", "none", cure)
     if is_distorted(pair[0]):
-        cure = "Rectify the images, or give what belongs to one without it (undistorted.png of a first run)."
+        cure = "Rectify the images, or give maps of undistorted.png, which a first run writes."
         names = ("points_confidence", "disparity", "prior_map")
         options.refuse(names, "of an image without lens distortion", "a lens with distortion", cure)
     lenses = [*pair, *further] if further else [*pair, *(pair[0] for _ in options.view)]

@@ -37,17 +37,17 @@ from geodiff_plugin.runtime.machine import pick_device
 
 #: What became of every pair, as it is known to all processes of a run.
 JOURNAL = ".pairs.jsonl"
-#: A table of more pairs than this has only those that want to be looked at.
+#: A table of more pairs than this shows only failed and untrusted ones.
 MOST_ROWS = 20
 #: Options that a result does not depend on.
 NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "strict", "steady", "device", "encoding"}
-#: Behind an error, they say that the next pair cannot be written either.
+#: With one of these causes the next pair cannot be written either.
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 Row = dict[str, Any]
 
 
 class _EndsRun(BaseException):
-    """What no pair can be spared: the prior does not load, the disk is full; its cause says which."""
+    """Ends the whole run: the prior does not load or the disk is full; its cause says which."""
 
 
 @contextmanager
@@ -192,11 +192,11 @@ def _row(report: dict[str, Any]) -> Row:
 
 
 def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
-    """Refuse one distance for all pairs of a model, whose cameras are differently far from each other."""
+    """Refuse one baseline for all pairs of a model, because its pairs have different ones."""
     given = [] if options.baseline is None or len(refs) < 2 else [options_of(ref, options) for ref in refs]
     for calib in dict.fromkeys(each.calib for each in given if each.calib):
         if has_pose_per_image(calib if len(calib) > 1 else calib[0]):
-            cure = "Every pair has another one. Give the model's scale: geodiff capture MODEL --known-length."
+            cure = "Every pair has its own. Give the model's scale: geodiff capture MODEL --known-length."
             bad_value("--baseline", "left out with many pairs of one model", str(calib[0]), cure)
 
 

@@ -72,9 +72,9 @@ class DepthOptions(RunOptions):
     cropped: bool = _camera(False, "The principal point may lie outside: the images are crops.")
     prior_map: Path | None = declare(None, "Another model's map of LEFT (or folder of maps) as the prior.")
     points: Path | None = declare(None, "Known depths: a map of LEFT, or points (.npy, text, .ply).")
-    points_scale: float | None = declare(None, "Its units per metre: 1000 for mm.", above_0="units per metre")
+    points_scale: float | None = declare(None, "Units per metre: 1000 for mm.", above_0="units per metre")
     disparity: Path | None = declare(None, "Disparities of LEFT in a rectified rig, instead of --points.")
-    points_confidence: Path | None = declare(None, "How far to rely on them, in [0, 1], of the same shape.")
+    points_confidence: Path | None = declare(None, "Confidence of each known depth, [0, 1], same shape.")
     topic_left: str | None = declare(None, "Topic of the left images, where LEFT is a bag.", "--left")
     topic_right: str | None = declare(None, "Topic of the right images, where LEFT is a bag.", "--right")
     tolerance: float = declare(0.005, "A bag: most seconds between the stamps of a pair.", low=0.0, high=10.0)
@@ -83,7 +83,7 @@ class DepthOptions(RunOptions):
     min_confidence: float = _output(0.0, "Least confidence of a point in the cloud, 0 to 1.", low=0, high=1)
     out: Path | None = _output(None, "Folder; geodiff-out, or -2 and so on if taken.", "--out", "-o")
     overwrite: bool = _output(False, "Write into a folder that holds files; do finished pairs anew.")
-    strict: bool = _output(False, "End with an error if the result is not to be trusted.")
+    strict: bool = _output(False, "End with an error unless the result is trusted.")
     export: tuple[str, ...] = _output(
         (), "Also glb (cloud), mesh (textured, GLB) or colmap; repeatable.", choices=("glb", "mesh", "colmap")
     )
@@ -161,7 +161,7 @@ class DepthOptions(RunOptions):
                 bad_value(option, f"given once for each of {views} --view", f"{len(given)} times")
 
     def _excluded(self) -> list[tuple[bool, str, str, str, str]]:
-        """When, which options, and what a message says that they must be, what came instead, and the cure."""
+        """Rows: the condition, the options that it forbids, and the message's expected, got and cure."""
         alone, no_points, no_disparity = (v is None for v in (self.right, self.points, self.disparity))
         paper, posed = self.preset == "paper", not self.estimate_pose
         default = "given with the default preset", "--preset paper"

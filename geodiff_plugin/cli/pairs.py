@@ -27,7 +27,7 @@ LISTS = (".csv", ".tsv", ".txt")
 class PairRef:
     """One pair of many, in a folder ``name`` below ``--out`` that no other pair has.
 
-    ``left`` and ``right`` are images, or the videos that they are a frame of; one with both views is alone.
+    ``left`` and ``right`` are images, or videos that hold the frame; a side-by-side video has no ``right``.
     """
 
     name: str

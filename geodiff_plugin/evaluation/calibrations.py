@@ -154,8 +154,8 @@ def _as_it_is(sample: StereoSample, _: StereoSample) -> StereoSample:
 
 #: Kind -> what it is, how a sample becomes so beside another one, and what true points are multiplied by.
 KINDS: dict[str, tuple[str, Change, float | None]] = {
-    "right": ("right", _as_it_is, None),
-    "right, points": ("right, points", _as_it_is, 1.0),
+    "right": ("correct", _as_it_is, None),
+    "right, points": ("correct, points", _as_it_is, 1.0),
     "swapped": ("left and right images exchanged", lambda s, _: replace(s, left=s.right, right=s.left), None),
     "inverse": ("E is world-to-camera", lambda s, _: replace(s, E=np.linalg.inv(s.E)), None),
     "axis": ("E along y where it is along x", lambda s, _: _moved(s, s.E[[1, 0, 2], 3]), None),

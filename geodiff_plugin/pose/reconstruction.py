@@ -32,7 +32,7 @@ def pycolmap() -> Any:
     try:
         import pycolmap
     except ImportError:
-        cure = "pip install 'geodiff-plugin[capture]', or keep the poses as they are with --poses given."
+        cure = "pip install 'geodiff-plugin[capture]', or pip install pycolmap."
         bad_value("pycolmap", "installed to solve for the poses of a capture", "missing", cure)
     pycolmap.logging.minloglevel = 3
     return pycolmap

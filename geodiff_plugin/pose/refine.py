@@ -39,7 +39,7 @@ WARNS_PX = 1.0
 # A refinement must remove this share of the residual, and may turn and shift a camera by this much at most.
 _LEAST_GAIN, _MOST_TURN_DEG, _MOST_SHIFT = 0.1, 8.0, 0.8
 #: Relative standard deviation, under the poses of a tracker, of the distance between two cameras and of the
-#: scene's median depth; measured on 85 pairs of two trackers (docs/how-to/poses.md).
+#: scene's median depth; measured on 85 pairs of two trackers.
 LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.05
 # The user is warned if the pose that fits best changes log depth by more than this, in the median.
 _MOST_SPREAD = 0.13
@@ -270,7 +270,7 @@ def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[str, ..
     if spread < _MOST_SPREAD:
         return ()
     return (
-        "The matches do not settle the pose: another one fits them as well, and its depths differ by "
+        "The matches do not determine the pose: another one fits them as well, and its depths differ by "
         f"{100 * np.expm1(spread):.0f} % in the median. Give a more exact pose, or views from further apart.",
     )
 

@@ -33,10 +33,10 @@ FREE_PX = 1e3
 #: The user is warned if an estimated pose leaves depth a larger relative standard deviation than this.
 MOST_SPREAD = 0.06
 _STEPS = 12
-# How far a refined pose may move the points, also along their lines: the residual that it explains times a
-# share. The share is 1 where that residual is the first number times the cameras' other errors (rolling
-# shutter, lenses, K), which residuals of neighbours have in common. It grows with the fourth power of that
-# ratio, within bounds: below, a free pose would hide those errors; above, the given pose was wrong.
+# A refined pose may move the points, also along their lines, by a share of the residual that it explains:
+# (explained residual / (first number * faults))^4, within bounds. Faults are errors of the cameras (rolling
+# shutter, lenses, K), which the residuals of neighbours have in common. Below, a free pose would hide the
+# faults; above, the given pose was wrong.
 _FAULTS, _MOVED_SHARE = 5.6, (0.2, 40.0)
 _FLOOR_PX, _LEAST_FAULT_PX = 0.05, 0.03
 # A rectified pair has another share and a narrower prior: its cameras are bolted together, turn by tenths
@@ -90,7 +90,7 @@ class _Whitened(NamedTuple):
     cost: float  # sum of log(1 + (residual / scale)^2)
     inverse_depth: np.ndarray  # (N,) 1/m that fits a track best
     residuals: np.ndarray  # (N, n)
-    left_by_pose: np.ndarray  # (N, n, 6V) by _turned's step of every view that no change of depth compensates
+    left_by_pose: np.ndarray  # (N, n, 6V) derivative by every view's step (_turned), depth eliminated
     depth_by_pose: np.ndarray  # (N, 6V) what a step does to the inverse depth, times minus slopes
     slopes: np.ndarray  # (N,)
 
@@ -211,7 +211,7 @@ def nearby_poses(sparse: Tracks, given: np.ndarray, before: np.ndarray) -> np.nd
 def settle_poses(
     tracks: Tracks, given: np.ndarray, near: np.ndarray, before: np.ndarray, rig: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses that fit all matches, kept the nearer to the given ones the better these fit.
+    """Poses that fit all matches; the better the given ones fit, the nearer to them.
 
     ``given`` and ``near (V, 4, 4)``, which fit roughly, are ``T_right_from_left``; ``before (V,)`` pixels,
     ``median_residuals`` of the poses as given; ``rig`` whether these are those of a rectified rig.
@@ -273,7 +273,7 @@ def undetermined_pose(spread: float | None) -> tuple[str, ...]:
     if spread is None or spread <= MOST_SPREAD:
         return ()
     return (
-        f"The matches leave the estimated pose open: by it alone depths may be off by {100 * spread:.0f} % "
-        "(one standard deviation). Take photographs that show more texture or are further apart, or give "
-        "the pose.",
+        "The matches do not determine the estimated pose: by it alone depths may be off by "
+        f"{100 * spread:.0f} % (one standard deviation). Take photographs that show more texture or are "
+        "further apart, or give the pose.",
     )

@@ -39,8 +39,8 @@ def depth_evidence(
 ) -> Tensor:
     """Features ``(B, 5, H, W)`` of the logistic model in ``depth_confidence``, whose arguments these are.
 
-    They are 1, certainty, strength, agreement and spread. The less support a pixel has, the more its error of
-    the prior goes from the measured one to that of a useless prior. Certainty is the log of .05 over the
+    They are 1, certainty, strength, agreement and spread. With less support, a pixel's prior error moves from
+    the measured one towards a useless prior's. Certainty is the log of .05 over the
     remaining error, ``(1 - support) * error``; strength is the log of .15 over ``error``, because wrong
     matches lose their weight with a good prior, while a poor one follows them. Agreement is the log of .1
     over the photometric error.

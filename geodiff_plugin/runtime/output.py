@@ -235,8 +235,8 @@ def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> Metr
         return np.block([[E[:3, :3], factor * E[:3, 3:]], [E[3:]]])
 
     warning = (
-        f"No length is known: the metres are the prior's own, and as wrong as those. From pixel to pixel its "
-        f"depth and that of the views differ by {100 * spread:.0f} % in the middle."
+        "No length is known: the metres are the prior's own, with its errors. Its depth and the depth from "
+        f"the views differ by {100 * spread:.0f} % in the median."
     )
     output.prediction = output.prediction * factor
     output.uncertainty = None if output.uncertainty is None else output.uncertainty * factor

@@ -230,7 +230,7 @@ def _why_points(run: Indicators) -> str:
             "leave them out."
         )
     causes = [text for factor, text in FACTORS.items() if abs(math.log(ratio / factor)) < NEARLY]
-    cause = causes[0] if causes else "a unit, the baseline or K may be off by that, or the points want a pose"
+    cause = causes[0] if causes else "a unit, the baseline or K is wrong, or the points are in another frame"
     return f"The points lie {float(f'{ratio:.3g}'):g} times as far as what both views match: {cause}."
 
 
@@ -248,7 +248,7 @@ def _why_order(run: Indicators) -> str:
     if run.order < LEAST_ORDER and varied and not run.matched > MATCHED_ENOUGH:
         return (
             f"The prior and the matches hardly agree on near and far (rank correlation {run.order:+.2f}): "
-            "is E or K wrong, is the order of the images, or does the right image show something else?"
+            "is E, K or the order of the images wrong, or is the right image of something else?"
         )
     return ""
 

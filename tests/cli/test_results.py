@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from geodiff_plugin import plotting
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
-from geodiff_plugin.cli import outputs
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.images import distortion_from_text, undistorted
 from tests.cli.conftest import QUICK, report_of
@@ -95,13 +95,13 @@ def test_video(geodiff, maps, name):
 
 
 def test_a_video_has_metres_unless_a_report_says_that_there_are_none(geodiff, maps, monkeypatch):
-    units, drawn = [], outputs.depth_frames
+    units, drawn = [], plotting.depth_frames
 
     def noting(*arguments, **named):
         units.append(named["unit"])
         return drawn(*arguments, **named)
 
-    monkeypatch.setattr(outputs, "depth_frames", noting)
+    monkeypatch.setattr(plotting, "depth_frames", noting)
     for unit in ("m", None):
         Path("depth.npy").write_bytes(Path(maps[0]).read_bytes())
         Path("report.json").write_text(json.dumps({"unit": unit}))

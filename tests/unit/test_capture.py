@@ -303,7 +303,7 @@ def test_frames_that_are_not_trusted_are_named_and_marked(model, monkeypatch):
 
     monkeypatch.setattr(run, "_write_frame", doubting)
     monkeypatch.setattr("geodiff_plugin.capture.results.fuse", fusing)
-    monkeypatch.setattr("geodiff_plugin.capture.results.grid", noting)
+    monkeypatch.setattr("geodiff_plugin.plotting.grid", noting)
     report = run.capture_report(options)
     assert report["not_trusted"] == ["f04"]
     assert "; NOT TRUSTED: f04 -> " in run.summary(report, options.out)

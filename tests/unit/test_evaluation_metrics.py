@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geodiff_plugin.evaluation import metrics
@@ -52,6 +52,7 @@ def test_disparity_metrics_pixel_by_pixel(step_px):
     assert math.isnan(metrics.evaluate_disparity(np.full((1, 5), NAN), truth, valid, step_px)["epe"])
 
 
+@settings(deadline=None)
 @given(seed=st.integers(0, 200), steps=st.integers(1, 30))
 def test_ause_pixel_by_pixel(seed, steps):
     pred, truth, valid = maps(seed)

@@ -104,7 +104,7 @@ def test_a_shift_that_makes_up_for_a_turn_comes_back() -> None:
     assert depth_error(tracks, settled(tracks, given), depth_m) < 0.5 * depth_error(tracks, given, depth_m)
     assert undecided(tracks, Ts, Ts) == ()
     other = np.linalg.inv(TRUE @ pose((0.0, 1.0, 0.0), (0, 0, 0)))[None]
-    assert "do not settle the pose" in undecided(tracks, Ts, other)[0]
+    assert "do not determine the pose" in undecided(tracks, Ts, other)[0]
 
 
 def test_the_refinement_is_joint_and_reaches_the_optimum() -> None:
