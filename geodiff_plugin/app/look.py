@@ -10,7 +10,7 @@ HEADER = """
   <h1>Depth in metres from two photographs</h1>
   <p>A diffusion model gives the shape, a second view with a known camera the metres.
   Drop both photographs, say where the cameras are, and measure. What you give is deleted after ten
-  minutes.</p>
+  minutes, or when you close this tab.</p>
 </div>
 """
 BUSY = '<div class="say say-busy"></div>'

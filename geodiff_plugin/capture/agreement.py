@@ -148,7 +148,7 @@ def rendered(other: DepthFrame, frame: DepthFrame, values: np.ndarray) -> tuple[
     for v, u in ((0, 1), (2, 1), (1, 0), (1, 2)):
         gaps = maps[0] == 0
         for into in maps:
-            around = np.pad(into, ((1, 1), (1, 1), *((0, 0),) * (into.ndim - 2)))
+            around = np.pad(into, [(1, 1), (1, 1), (0, 0)][: into.ndim])
             into[gaps] = around[v : v + height, u : u + width][gaps]
     return maps
 

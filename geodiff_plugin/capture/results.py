@@ -131,8 +131,8 @@ def write_results(
     return {"cloud_points": count}
 
 
-def _pixels(capture: Capture, name: str) -> np.ndarray:
-    return np.rint(capture.image(name) * 255).astype(np.uint8)
+def _pixels(image_01: np.ndarray) -> np.ndarray:
+    return np.rint(image_01 * 255).astype(np.uint8)
 
 
 def _sheet(capture: Capture, out: Path, names: Sequence[str], doubted: Sequence[str]) -> None:
@@ -141,9 +141,9 @@ def _sheet(capture: Capture, out: Path, names: Sequence[str], doubted: Sequence[
     depths, unit = [np.load(out / name / "depth.npy") for name in shown], capture.unit
     alike, figure = len({depth.shape for depth in depths}) == 1, partial(plotting.depth_figure, unit=unit)
     figures = plotting.depth_frames(depths, unit=unit) if alike else map(figure, depths)
-    cells: list[Image.Image] = []
+    cells: list[Any] = []
     for name, drawn in zip(shown, figures, strict=True):
-        cells += [Image.fromarray(_pixels(capture, name)), drawn]
+        cells += [capture.image(name), drawn]
     titles = [t for name in shown for t in (name, "depth, not trusted" if name in doubted else "depth")]
     with atomic_path(out / "sheet.jpg") as temporary:
         plotting.grid(cells, titles, columns=min(4, len(cells)), cell_width=360).save(temporary, quality=88)
@@ -156,7 +156,7 @@ def _video(capture: Capture, out: Path, names: Sequence[str]) -> None:
 
     def frames() -> Iterator[Image.Image]:
         for name, depth in zip(names, maps, strict=True):
-            halves = _pixels(capture, name), plotting.colour_depth(depth, near, far)
+            halves = _pixels(capture.image(name)), plotting.colour_depth(depth, near, far)
             yield ImageOps.pad(Image.fromarray(np.hstack(halves)), VIDEO_SIZE)
 
     try:
@@ -235,7 +235,7 @@ def write_workspace(
         (folder / name).mkdir(parents=True, exist_ok=True)
     views, maps, colours = [], folder / "stereo", np.zeros(points.shape, np.uint8)
     for frame, observed in zip(frames, seen, strict=True):
-        picture = np.rint(image(frame.name) * 255).astype(np.uint8)
+        picture = _pixels(image(frame.name))
         size = picture.shape[1::-1]
         Image.fromarray(picture).save(folder / "images" / f"{frame.name}.png")
         u, v = np.rint(observed.px).astype(int).T.clip(0, np.array(size)[:, None] - 1)

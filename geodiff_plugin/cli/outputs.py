@@ -163,13 +163,13 @@ def summary_line(report: dict[str, Any], where: str) -> str:
     if verdict["status"] != "trusted":
         reason = verdict["reasons"][0] if verdict["reasons"] else "neither matches nor known depths test it."
         return f"{verdict['status'].upper()}: {reason} (Unconfirmed: {metres}; {end})"
-    signs, error, over_prior = verdict["signs"], report.get("expected_error_median_m"), report["prior_scale"]
+    signs, error, prior_scale = verdict["signs"], report.get("expected_error_median_m"), report["prior_scale"]
     trusted = ["trusted"]
     trusted += [] if signs["confidence"] is None else [f"confidence {signs['confidence']:.2f}"]
     trusted += [] if error is None else [f"expected error {_length(error, report['unit'])}"]
     trusted += [] if signs["matched"] is None else [f"{100 * signs['matched']:.0f} % matched"]
     trusted += [f"{signs['points']} known depths"] if signs["points"] else []
-    scale = [] if over_prior is None else [f"prior's own metres x {over_prior[0][0]:.2f}"]
+    scale = [] if prior_scale is None else [f"prior's own metres x {prior_scale[0][0]:.2f}"]
     return "; ".join([metres, ", ".join(trusted), *scale, end])
 
 

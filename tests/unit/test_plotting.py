@@ -111,6 +111,7 @@ def draw(scenes, make_pipeline, tmp_path):
         answer = CliRunner().invoke(eval_app, given, catch_exceptions=False)
         assert answer.exit_code == 0 and answer.stdout == f"{out / f'figure-{name}.png'}\n"
         with Image.open(out / f"figure-{name}.png") as image:
+            assert image.mode == "RGB"
             picture = np.asarray(image)
         assert picture.shape[0] > 100 and picture.std() > 5
         numbers = json.loads((out / f"figure-{name}.json").read_text())
