@@ -202,4 +202,5 @@ def test_bench(monkeypatch, geodiff, prior):
     assert re.search(r"geodiff depth: [\d.]+ s \(start .*guided call [\d.]+, write", printed)
     rows = [line.split() for line in printed.splitlines() if line.lstrip().startswith(("plain", "guided,"))]
     seconds, ratios = zip(*((float(words[-4]), float(words[-2])) for words in rows), strict=True)
-    assert len(rows) == 3 and ratios == pytest.approx([each / seconds[0] for each in seconds], rel=0.1)
+    rounding = 0.02 + 0.006 / seconds[0]  # seconds are printed to a hundredth
+    assert len(rows) == 3 and ratios == pytest.approx([each / seconds[0] for each in seconds], rel=rounding)
