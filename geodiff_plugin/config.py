@@ -377,6 +377,7 @@ def config_from_text(entries: Iterable[str], base: GuidanceConfig, name: str) ->
         knob, _, term = written.partition(".")
         if not equals or knob not in KNOBS or (knob == "weights") != bool(term):
             cure = close_names(written, [*(n for n in KNOBS if n != "weights"), "weights.NAME"])
+            cure = f"Write {written}=VALUE." if knob in KNOBS and not equals else cure
             bad_value(name, "KNOB=VALUE with a knob of GeometryGuidance", repr(entry), cure)
         try:
             value = json.loads(text)

@@ -59,7 +59,7 @@ def depth_range(depth_m: Any, near: float | None = None, far: float | None = Non
         if value is not None:
             check_positive(value, name, "metres")
     if near is not None and far is not None and near >= far:
-        bad_value("near, far", "near < far, in metres", f"{near}, {far}")
+        bad_value("near (--near)", "less than far (--far)", f"{near:g} and {far:g}")
     depth_m = _as_map(depth_m)
     use = _known(depth_m)
     every = math.isqrt(max(1, depth_m.size // MOST_FOR_RANGE))

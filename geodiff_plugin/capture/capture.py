@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any, Self
@@ -22,8 +23,6 @@ from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.pose.capture import SolvedCapture, solve_capture
 from geodiff_plugin.types import MetricDepthOutput
 
-#: Shares of red, green and blue in grey.
-GREY = np.array([0.299, 0.587, 0.114], np.float32)
 #: A solve that moved the given poses, or estimated them; its points count from this many frames on.
 ADJUSTED, FEWEST_FRAMES = ("solved", "estimated"), 3
 #: What 7-Scenes writes where depth is unknown.
@@ -92,14 +91,15 @@ class Capture:
             return list(self.names)
         if ":" not in wanted:
             return [self.frame(name.strip()).name for name in wanted.split(",") if name.strip()]
-        try:
-            first, last, step = (*(int(part) if part else None for part in wanted.split(":")), None)[:3]
-        except ValueError:
-            bad_value("--frames", "NAME,NAME or FIRST:LAST:STEP with numbers from 0", repr(wanted))
-        chosen = self.names[first : None if last is None else last + 1 : step]
-        if not chosen:
-            bad_value("--frames", f"numbers from 0 to {len(self) - 1}", repr(wanted))
-        return chosen
+        numbers = re.fullmatch(r"(\d*):(\d*)(?::0*([1-9]\d*))?", wanted)
+        first, last, step = (
+            (int(part) if part else None for part in numbers.groups()) if numbers else (0, -1, 1)
+        )
+        last = len(self) - 1 if last is None else last
+        if not (first or 0) <= last < len(self):
+            expected = f"NAME,NAME or FIRST:LAST:STEP, rising numbers from 0 to {len(self) - 1}"
+            bad_value("frames (--frames)", expected, repr(wanted))
+        return self.names[first : last + 1 : step]
 
     @property
     def poses(self) -> np.ndarray | None:
@@ -119,7 +119,7 @@ class Capture:
         if self.solved is None:
             images, frames = map(self.image, self.names), self.files.frames
             self.solved = solve_capture(
-                (np.rint(image @ GREY * 255).astype(np.uint8) for image in images),
+                (np.rint(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) * 255).astype(np.uint8) for x in images),
                 np.stack([frame.K for frame in frames]),
                 self.poses,
                 [frame.size for frame in frames],
@@ -180,27 +180,34 @@ class Capture:
         size = self.frame(name).size
         return GeometryGuidance.from_views(views, left_size=size, unit=self.unit, **settings | knobs)
 
+    def check_points(self, points: str, scaled: bool = False) -> None:
+        """``InputError`` where no frame has such known depths, or they will not be in metres (``scaled``)."""
+        check_choice(points, "points", POINTS)
+        needed = {"model": "points of a COLMAP model", "depth": "depth maps that the capture names"}
+        if points not in needed:
+            return
+        if all((frame.points if points == "model" else frame.depth) is None for frame in self.files.frames):
+            bad_value("points (--points)", needed[points], f"{points!r} for a {self.files.kind} without")
+        if self.unit is None and not scaled:
+            cure = "Give --metres-per-unit, --known-length or --distance."
+            bad_value("points (--points)", "of a capture whose scale is known", "one without a unit", cure)
+
     def known_depths(self, name: str, points: str) -> np.ndarray | None:
         """Known depths of a frame, as ``GeometryGuidance(points=...)`` takes them; ``None`` for none.
 
         Raises:
             InputError: a capture without such points, or without a unit.
         """
-        check_choice(points, "points", POINTS)
+        self.check_points(points)
         frame = self.frame(name)
         if points == "none":
             return None
         if points == "tracks":
             return self._tracked(self.names.index(frame.name))
-        if self.unit is None:
-            cure = "Give --metres-per-unit, --known-length or --distance."
-            bad_value("points", "of a capture whose scale is known", "one without a unit", cure)
         if points == "depth":
             depth_m, known = self.measured_depth(name)
             depth_m = np.where(known, depth_m, 0.0).astype(np.float32)
             return cv2.resize(depth_m, frame.size, interpolation=cv2.INTER_NEAREST)
-        if all(each.points is None for each in self.files.frames):
-            bad_value("points", "of a COLMAP model", f"a capture of {self.files.kind}, which has none")
         if frame.points is None or frame.E is None:
             return None
         return _in_camera(frame.points, frame.E)

@@ -50,8 +50,8 @@ def _depth(options: DepthOptions) -> None:
     from geodiff_plugin.formats.recordings import is_bag
 
     if not is_bag(options.left):
-        names = ("topic_left", "topic_right")
-        options.refuse(names, "left out where LEFT is no bag", "given", "Images are LEFT and RIGHT.")
+        names = ("topic_left", "topic_right", "tolerance", "encoding")
+        options.refuse(names, "left out where LEFT is not a bag", cure="Only bags have topics and stamps.")
     if is_bag(options.left):
         failed = _imported("cli.many.run_bag")(options)
     elif is_many(options.left):
@@ -108,6 +108,7 @@ class _Video:
     fps: float = declare(10.0, "Frames a second.")
     near: float | None = declare(None, "Depth of the last colour, metres.")
     far: float | None = declare(None, "Depth of the first colour, metres.")
+    overwrite: bool = _out(False, "Replace a file of that name.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,11 +25,11 @@ from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.capture.results import ALONE, save_alone, write_agreement, write_results
 from geodiff_plugin.cli.depth import load_guided_prior
 from geodiff_plugin.cli.options import CaptureOptions
-from geodiff_plugin.cli.outputs import single_map, write_maps
+from geodiff_plugin.cli.outputs import plain, single_map, verdict_report, write_maps
 from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, collected_warnings, say
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
-from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, write_text
+from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, check_new, write_text
 from geodiff_plugin.pose.capture import Observations, SolvedCapture
 from geodiff_plugin.runner import BROKEN, Item, Journal, Runner, fingerprint, this_process
 from geodiff_plugin.runtime.machine import pick_device
@@ -57,6 +57,7 @@ def open_capture(options: CaptureOptions) -> Capture:
     capture = Capture.open(options.path, K=K, fov=options.fov, trajectory=options.trajectory)
     if options.poses == "given" and capture.poses is None:
         bad_value("--poses given", "used with a capture that has poses", f"{options.path} without")
+    capture.check_points(options.points, any(getattr(options, way) is not None for way in OF_SCALE))
     _length(capture, options)
     return capture
 
@@ -172,7 +173,7 @@ def _write_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[],
     output = _depth(capture, pipe, name, options, options.points)
     depth, solved, number = single_map(output.prediction), capture.solve(), capture.names.index(name)
     low, middle, high = (float(v) for v in np.percentile(depth, (2, 50, 98)))
-    report = {
+    report: Record = {
         "version": __version__,
         "frame": name,
         "neighbours": capture.neighbours(name, options.neighbours),
@@ -180,10 +181,10 @@ def _write_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[],
         "K": np.asarray(output.K)[0].tolist(),
         "T_world_from_camera": solved.E[number].tolist(),
         "connected": bool(solved.connected[number]),
-        "scale_spread": _rounded(solved.scale_spread),
+        "scale_spread": plain(round(solved.scale_spread, 4)),
         "depth": {"p02": low, "median": middle, "p98": high},
         "poses": [pose.status for pose in output.poses],
-        "trusted": [bool(verdict.trusted) for verdict in output.verdicts],
+        "verdict": verdict_report(output),
         "warnings": list(output.warnings),
     }
 
@@ -196,10 +197,6 @@ def _write_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[],
     with OutFolder(options.out / name, overwrite=True) as out:
         out.write(fill)
     return report
-
-
-def _rounded(value: float) -> float | None:
-    return round(value, 4) if math.isfinite(value) else None
 
 
 def _run_frames(
@@ -259,7 +256,8 @@ def capture_report(options: CaptureOptions) -> Record:
     names = capture.choose(options.frames)
     for note in capture.files.notes:
         say(note)
-    options.out.mkdir(parents=True, exist_ok=True)
+    ours = any((options.out / name).is_file() for name in (POSES_FILE, JOURNAL))
+    check_new(options.out, ours or options.overwrite).mkdir(parents=True, exist_ok=True)
     factor = solved_poses(capture, options)
     seconds = {"poses": round(time.perf_counter() - started, 1)}
     solved = capture.solve()
@@ -271,7 +269,7 @@ def capture_report(options: CaptureOptions) -> Record:
     seconds["frames"] = round(time.perf_counter() - started - seconds["poses"], 1)
     done = [report["frame"] for report in frames if report.get("status") != BROKEN]
     agreement = write_agreement(capture, options.out, done)
-    doubted = [report["frame"] for report in frames if not all(report.get("trusted", ()))]
+    doubted = [f["frame"] for f in frames if "verdict" in f and f["verdict"]["status"] != "trusted"]
     files = write_results(capture, options.out, done, options.export, doubted)
     seconds["agreement and cloud"] = round(time.perf_counter() - started - sum(seconds.values()), 1)
     report = {
@@ -300,7 +298,7 @@ def _pose_report(capture: Capture) -> Record:
         "scale_by_depth": solved.scale_depth,
         "scale_spread": solved.scale_spread,
     }
-    rounded = {name: _rounded(value) for name, value in numbers.items()}
+    rounded = plain({name: round(value, 4) for name, value in numbers.items()})
     each = zip(capture.names, solved.connected, *solved.moved(), strict=True)
     frames = {
         name: {"connected": bool(c), "moved": round(float(m), 5), "turned_deg": round(float(t), 3)}
@@ -315,7 +313,7 @@ def run_capture(options: CaptureOptions) -> None:
     with collected_warnings():
         report = capture_report(options)
     print(json.dumps(report, indent=2) if options.json else summary(report, options.out))
-    if any("error" in frame for frame in report["frames"]):
+    if any("error" in frame for frame in report["frames"]) or (options.strict and report["not_trusted"]):
         sys.exit(EXIT_SOME_FAILED)
 
 
@@ -328,4 +326,6 @@ def summary(report: Record, out: Path) -> str:
         line += f", median depth {depths[len(depths) // 2]:.2f} {unit}"
     if doubted := report["not_trusted"]:
         line += f"; NOT TRUSTED: {', '.join(doubted[:9])}{' ...' if doubted[9:] else ''}"
+        reasons = next(f["verdict"]["reasons"] for f in report["frames"] if f["frame"] == doubted[0])
+        line += f" ({doubted[0]}: {' '.join(reasons[:1]) or 'neither matches nor known depths test it'})"
     return f"{line} -> {out}/"

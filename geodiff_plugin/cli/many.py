@@ -27,7 +27,7 @@ from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, options_of, star
 from geodiff_plugin.cli.terminal import collected_warnings, new_table, say, show
 from geodiff_plugin.formats import recordings
 from geodiff_plugin.formats.files import file_digest
-from geodiff_plugin.formats.out import REPORT, atomic_path, reason_of, write_text
+from geodiff_plugin.formats.out import REPORT, atomic_path, check_new_file, reason_of, write_text
 from geodiff_plugin.formats.reading import has_pose_per_image
 from geodiff_plugin.guidance.evidence import EvidenceStore
 from geodiff_plugin.guidance.inputs import left_images
@@ -291,6 +291,7 @@ def _answer(rows: Sequence[Row], options: DepthOptions, out: Path) -> None:
     """Print the table and what it comes to, or the rows as JSON, and write ``pairs.csv``."""
     doubtful = [row for row in rows if row["verdict"] not in (None, "trusted")]
     failed = [row for row in rows if row["result"] == "failed"]
+    doubted = sum(row["verdict"] == "not trusted" for row in doubtful)
     if options.json:
         print(json.dumps(rows, indent=2))
     elif not options.quiet:
@@ -301,7 +302,8 @@ def _answer(rows: Sequence[Row], options: DepthOptions, out: Path) -> None:
             table.add_row(row["pair"], result, *("-" if v is None else f"{v:.2f}" for v in numbers))
         done, there = (sum(row["result"] == kind for row in rows) for kind in ("done", "there"))
         number = "1 pair" if len(rows) == 1 else f"{len(rows)} pairs"
-        totals = f"{done} done, {there} there already, {len(failed)} failed, {len(doubtful)} not trusted"
+        totals = f"{done} done, {there} there already, {len(failed)} failed, {doubted} not trusted"
+        totals += f", {len(doubtful) - doubted} not judged" * (doubted < len(doubtful))
         messages = [Text(f"{row['pair']}: {row['message']}") for row in failed]
         show(table, Text(f"{number}: {totals} -> {out}/"), *messages)
     try:
@@ -320,8 +322,7 @@ def run_bag(options: DepthOptions) -> bool:
         bad_value(
             "--out", f"a file that ends in {' or '.join(recordings.BAG_SUFFIXES)}, as LEFT is a bag", out
         )
-    if out.exists() and not options.overwrite:
-        bad_value("--out", "a new file", f"{out}, which exists", "Name another, or add --overwrite.")
+    check_new_file(out, options.overwrite)
     pairs = recordings.list_pairs(options.left, topics, options.tolerance)
     frames = out.with_name(f"{out.stem}-frames")
     options, frame_id = _with_its_cameras(replace(options, out=frames), frames)

@@ -56,7 +56,7 @@ class DepthOptions(RunOptions):
     fy: float | None = _camera(None, "Focal length, pixels.")
     cx: float | None = _camera(None, "Principal point, pixels.")
     cy: float | None = _camera(None, "Principal point, pixels.")
-    baseline: float | None = _camera(None, "Distance of the cameras, metres; replaces that of --calib.")
+    baseline: float | None = _camera(None, "Between the cameras; replaces --calib's.", above_0="metres")
     cx_right: float | None = _camera(None, "cx of the right camera of a rectified pair; --cx if none.")
     k: Path | None = _camera(None, "3x3 intrinsics, text or .npy.", "--K")
     e: Path | None = _camera(None, "4x4 pose of the right camera in the left one's frame, metres.", "--E")
@@ -114,15 +114,17 @@ class DepthOptions(RunOptions):
         paths = [*self.photographs().values(), *(path for _, path in self.other_files())]
         return [f for p in paths for f in ([p / name for name in MODEL_FILES] if p.is_dir() else [p])]
 
-    def refuse(self, names: Iterable[str], expected: str, got: str, cure: str = "") -> None:
-        """Refuse the first option of these that was given."""
+    def refuse(self, names: Iterable[str], expected: str, got: str = "", cure: str = "") -> None:
+        """Refuse the first option of these that was given, by its value if not by ``got``."""
         for field in fields(self):
-            if field.name in names and getattr(self, field.name) not in (None, (), False):
+            value = getattr(self, field.name)
+            if field.name in names and value != field.default:
+                got = got or (value[0] if isinstance(value, tuple) else value)
                 bad_value(flag_of(field), expected, got, cure)
 
     def bag_topics(self) -> tuple[str, str]:
         """The topics of ``--left`` and ``--right``."""
-        self.refuse(["right"], "left out where LEFT is a bag", "given", "Name the topics: --left, --right.")
+        self.refuse(["right"], "left out where LEFT is a bag", cure="Name the topics: --left, --right.")
         for flag, topic in (("--left", self.topic_left), ("--right", self.topic_right)):
             if topic is None:
                 bad_value(flag, "given as a topic of images, as LEFT is a bag", "nothing")
@@ -175,13 +177,7 @@ class DepthOptions(RunOptions):
             (paper, "view", *default, "Algorithm 1 has two views."),
             (posed, "fov known_length", *together, ""),
             (not posed, "calib cameras e view_e cx_right", "left out with --estimate-pose", "both", known),
-            (
-                not posed,
-                "steady",
-                "left out with --estimate-pose",
-                "both",
-                "Lengths differ from pair to pair.",
-            ),
+            (not posed, "steady", "left out with --estimate-pose", "both", "Each pair has its scale."),
             (not self.calib, "cameras", *of_file),
             (no_points, "points_scale", "given with --points", "no --points", ""),
             (not no_points, "disparity", "given in place of --points", "both", ""),
@@ -240,7 +236,7 @@ def check_files(options: DepthOptions, photographs: bool = True) -> None:
     for name, path in options.other_files():
         model = any(os.path.exists(path / file) for file in (*MODEL_FILES, "images.bin"))
         if not (name == "calibration" and model):  # missing files of a model are reported when it is read
-            check_file(path, name, "a calibration file" if name == "calibration" else "a file")
+            check_file(path, name)
 
 
 def start_pair(options: DepthOptions, photographs: bool = True) -> OutFolder:
@@ -284,6 +280,7 @@ class CaptureOptions(PriorOptions):
     processes: int | None = declare(None, "Processes; by default one a core.", low=1, high=1024)
     export: tuple[str, ...] = _output((), "colmap (workspace), mesh (TSDF).", choices=("colmap", "mesh"))
     overwrite: bool = _output(False, "Write into a folder that holds files; do finished frames anew.")
+    strict: bool = _output(False, "End with exit code 4 unless every frame is trusted.")
     quiet: bool = _output(False, "No progress bar.", "--quiet", "-q")
     json: bool = _output(False, "Print the report instead of a summary.")
 

@@ -21,7 +21,7 @@ from geodiff_plugin.cli.options import DepthOptions, told_apart
 from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.formats.depth import disparity_of_depth
 from geodiff_plugin.formats.files import read_npy
-from geodiff_plugin.formats.out import REPORT, write_text
+from geodiff_plugin.formats.out import REPORT, check_new_file, write_text
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runtime.confidence import expected_error
 from geodiff_plugin.runtime.machine import versions
@@ -89,6 +89,12 @@ def _rescaled(E: np.ndarray, output: MetricDepthOutput) -> np.ndarray:
     return E * np.array([1.0, 1.0, 1.0, output.rescaled])
 
 
+def verdict_report(output: MetricDepthOutput) -> dict[str, Any]:
+    """The verdict as reports have it, with the indicators as ``signs``."""
+    verdict: dict[str, Any] = plain(asdict(output.verdict))
+    return verdict | {"signs": verdict.pop("indicators")}
+
+
 def build_report(
     inputs: Inputs, output: MetricDepthOutput, pipe: Any, options: DepthOptions, warnings: list[str]
 ) -> dict[str, Any]:
@@ -98,16 +104,17 @@ def build_report(
     if output.visible is not None:
         visible = single_map(output.visible).astype(bool)
         error = float(single_map(output.photometric_error)[visible].mean()) if visible.any() else math.nan
-    verdict, spread, estimated = asdict(output.verdict), output.uncertainty, guidance.estimated
+    spread, estimated = output.uncertainty, guidance.estimated
     if estimated is not None:
         measures = ("inliers", "parallax_deg", "residual_px", "depth_spread")
         scale = {"scale_from": output.scale_from, "scale_spread": output.scale_spread}
         pose = {name: getattr(estimated, name) for name in measures} | scale | {"assumed": estimated.notes}
     names = ("K", "scale", "shift", "global_scale", "prior_scale", "prior_error", "unit", "assumed")
-    expected_m = expected_error(depth_m, guidance.inputs[0].K_left, used_poses(output, guidance))
+    cameras = guidance.inputs[0].K_left, used_poses(output, guidance)
+    expected_m = expected_error(depth_m, *cameras, np.nan_to_num(output.verdict.indicators.scale_spread))
     report = {
         "depth": depth_summary(depth_m, visible),
-        "verdict": verdict | {"signs": verdict.pop("indicators")},
+        "verdict": verdict_report(output),
         "photometric_error_mean": error,
         "expected_error_median_m": np.median(expected_m),
         "uncertainty_median_m": None if spread is None else np.median(single_map(spread)),
@@ -164,7 +171,7 @@ def summary_line(report: dict[str, Any], where: str) -> str:
         reason = verdict["reasons"][0] if verdict["reasons"] else "neither matches nor known depths test it."
         return f"{verdict['status'].upper()}: {reason} (Unconfirmed: {metres}; {end})"
     signs, error, prior_scale = verdict["signs"], report.get("expected_error_median_m"), report["prior_scale"]
-    trusted = ["trusted"]
+    trusted = ["trusted if what is assumed holds" if report.get("assumed") else "trusted"]
     trusted += [] if signs["confidence"] is None else [f"confidence {signs['confidence']:.2f}"]
     trusted += [] if error is None else [f"expected error {_length(error, report['unit'])}"]
     trusted += [] if signs["matched"] is None else [f"{100 * signs['matched']:.0f} % matched"]
@@ -261,9 +268,12 @@ def _map(path: Path) -> np.ndarray:
     return mapped
 
 
-def run_video(frames: Sequence[Path], out: Path, fps: float, near: float | None, far: float | None) -> None:
+def run_video(
+    frames: Sequence[Path], out: Path, fps: float, near: float | None, far: float | None, overwrite: bool
+) -> None:
     """Write the video, whose legend is in metres unless a report says that its map has none."""
     plotting.check_video(out, fps)
+    check_new_file(out, overwrite)
     files = [path / "depth.npy" if os.path.isdir(path) else path for path in frames]
     depths_m = [_map(file) for file in files]
     sizes = ["{1}x{0}".format(*depth_m.shape) for depth_m in depths_m]
@@ -274,7 +284,7 @@ def run_video(frames: Sequence[Path], out: Path, fps: float, near: float | None,
     metric = all(read_report(file.parent).get("unit", "m") is not None for file in files)
     pictures = plotting.depth_frames(depths_m, near=near, far=far, unit="m" if metric else None)
     plotting.write_depth_video(out, pictures, fps)
-    print(f"{len(frames)} frames, {len(frames) / fps:.1f} s -> {out}")
+    print(f"{len(frames)} frame{'s' * (len(frames) > 1)}, {len(frames) / fps:.1f} s -> {out}")
 
 
 def run_submit(results: Sequence[Path], to: str, out: Path, method: str) -> None:

@@ -45,7 +45,7 @@ def is_many(left: Path) -> bool:
 def start_many(options: DepthOptions) -> list[PairRef]:
     """Find the pairs of a run over many, and make all checks that need neither images nor torch."""
     names = ("points", "disparity", "view", "known_length")
-    options.refuse(names, "left out with many pairs", "given", "It is of one pair.")
+    options.refuse(names, "left out with many pairs", cure="It belongs to one pair.")
     refs = find_pairs(options)
     each = [options_of(ref, options) for ref in refs]  # every pair has its map
     if refs[0].frame is not None:

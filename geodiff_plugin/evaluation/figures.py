@@ -23,7 +23,6 @@ from geodiff_plugin.algorithm.terms import masked_mean, photometric_map
 from geodiff_plugin.capture.agreement import DepthFrame, rendered
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load, select
-from geodiff_plugin.evaluation.datasets.sample import changed_ref
 from geodiff_plugin.evaluation.experiment import in_metres, measure_cells, method_cells, run_facts
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.options import FigureOptions
@@ -40,9 +39,6 @@ Drawing = tuple[Any, dict[str, Any]]
 #: Colours of lines, in order (Okabe and Ito's, distinguishable for the colour-blind), and their markers.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MARKERS = "osD^vP"
-EXPOSURE_METHODS = ("paper", "guided", "sgbm")
-#: Half and twice the light, and the steps between; also exponents.
-GAINS = (0.5, 0.7, 1.0, 1.4, 2.0)
 PRESETS = ("guided", "paper")
 
 
@@ -57,10 +53,6 @@ def _save_png(picture: Any, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
         image.save(temporary, format="PNG", optimize=True)
-
-
-def _style(index: int) -> dict[str, Any]:
-    return {"color": COLOURS[index % len(COLOURS)], "marker": MARKERS[index % len(MARKERS)], "markersize": 4}
 
 
 def _name_axes(axes: Any, x_name: str, y_name: str, x: Sequence[float] = ()) -> None:
@@ -94,20 +86,14 @@ def _curves(
     drawn: dict[str, list[float | None]] = {}
     for index, (name, of_method) in enumerate(groups.items()):
         done = [[value_of(record) for record in group if record["status"] == "ok"] for group in of_method]
-        means, marks = list(map(mean_with_interval, done)), _style(index)
+        means, colour = list(map(mean_with_interval, done)), COLOURS[index % len(COLOURS)]
+        marks = {"color": colour, "marker": MARKERS[index % len(MARKERS)], "markersize": 4}
         axes.plot(x, [mean.value for mean in means], label=find_method(name).title, **marks)
         if all(mean.low is not None for mean in means):
             low, high = [mean.low for mean in means], [mean.high for mean in means]
-            axes.fill_between(x, low, high, color=marks["color"], alpha=0.15, linewidth=0)
+            axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
         drawn[name] = [mean.value if mean.count else None for mean in means]
     return drawn
-
-
-def _two_panels(refs: Sequence[SampleRef], **how: Any) -> tuple[Any, Any, dict[str, Any]]:
-    """A figure of the samples, its two axes, and the samples as JSON values."""
-    figure = _new_figure(7.6, 3.1)
-    figure.suptitle(count_of_pairs(len(refs)), fontsize=9)
-    return figure, figure.subplots(1, 2, **how), {"samples": [ref.label for ref in refs]}
 
 
 def draw_inner_steps(options: FigureOptions) -> Drawing:
@@ -116,7 +102,10 @@ def draw_inner_steps(options: FigureOptions) -> Drawing:
     methods = {preset: [f"{preset}:inner_steps={n}" for n in updates] for preset in PRESETS}
     records = grouped(_records(options, refs, list(chain(*methods.values()))), "method")
     groups = {preset: [records.get(name, []) for name in names] for preset, names in methods.items()}
-    figure, panels, numbers = _two_panels(refs)
+    figure = _new_figure(7.6, 3.1)
+    figure.suptitle(count_of_pairs(len(refs)), fontsize=9)
+    panels = figure.subplots(1, 2)
+    numbers: dict[str, Any] = {"samples": [ref.label for ref in refs]}
     errors = _curves(panels[0], updates, groups, headline)
     seconds = _curves(panels[1], updates, groups, itemgetter("seconds"))
     for axes, title in zip(panels, ("AbsRel", "seconds a pair"), strict=True):
@@ -125,32 +114,6 @@ def draw_inner_steps(options: FigureOptions) -> Drawing:
     panels[1].legend(fontsize=8)
     numbers["updates"] = updates
     return figure, numbers | {p: {"abs_rel": errors[p], "seconds": seconds[p]} for p in PRESETS}
-
-
-def draw_exposure(options: FigureOptions) -> Drawing:
-    """Error against gain and against gamma of the right view; the left view stays as it is."""
-    methods, refs = options.methods or EXPOSURE_METHODS, select(options)
-    changes = {"gain": [(gain, 1.0) for gain in GAINS], "gamma": [(1.0, gamma) for gamma in GAINS]}
-    every = dict.fromkeys(changes["gain"] + changes["gamma"])
-    exposed = {change: [changed_ref(ref, "right_exposure", change) for ref in refs] for change in every}
-    records = _records(options, list(chain(*exposed.values())), methods)
-    of_sample = grouped(records, "method", "dataset", "sample")
-
-    def of_change(method: str, change: tuple[float, float]) -> list[Record]:
-        keys = [(method, ref.dataset, ref.name) for ref in exposed[change]]
-        return [record for key in keys for record in of_sample.get(key, [])]
-
-    drawn, (figure, panels, numbers) = list[float](), _two_panels(refs, sharey=True)
-    for axes, (name, values) in zip(panels, changes.items(), strict=True):
-        groups = {method: [of_change(method, change) for change in values] for method in methods}
-        curves = _curves(axes, GAINS, groups, headline)
-        numbers[name] = {"values": list(GAINS)} | curves
-        drawn += filter(None, chain(*curves.values()))
-        _name_axes(axes, f"{name} of the right view", "AbsRel" if name == "gain" else "", GAINS)
-    if drawn:  # errors of good and bad methods are decades apart
-        _plain_log_axis(panels[0].yaxis, min(drawn), max(drawn))
-    panels[0].legend(fontsize=8)
-    return figure, numbers
 
 
 #: Candidates, as many as the one-number search of the paper preset has; weight of SSIM; pictures shown.
@@ -303,7 +266,6 @@ FIGURES: dict[str, Callable[[FigureOptions], Drawing]] = {
     "gs-sweep": draw_gs_sweep,
     "inner-steps": draw_inner_steps,
     "ablation": partial(draw_side_by_side, ("prior-aligned", "reprojection-only", "guided")),
-    "exposure": draw_exposure,
     "qualitative": partial(draw_side_by_side, ("prior-aligned", "paper", "sweep-sgm", "guided")),
 }
 

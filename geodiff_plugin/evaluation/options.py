@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 PEERS = ("prior-aligned", "search-only", "paper", "guided", "sgbm")
 STRENGTH_METHODS = ("prior-aligned", "prior-fit", "guided", "search-only", "guided:inner_steps=5")
-FIGURES = ("gs-sweep", "inner-steps", "ablation", "exposure", "qualitative")
+FIGURES = ("gs-sweep", "inner-steps", "ablation", "qualitative")
 #: Emulated priors: mean absolute error of log depth, whether the map is blurred, its exponent, 1 for none.
 STRENGTHS = {f"{percent}%": (percent / 100, False, 1.0) for percent in (2, 5, 10, 20)}
 STRENGTHS = {"exact": (0.0, False, 1.0), **STRENGTHS, "blur": (0.01, True, 1.0), "gamma": (0.0, False, 1.6)}

@@ -94,6 +94,8 @@ def read_capture(
             expected = "a COLMAP model, a transforms.json, 7-Scenes, ScanNet or TUM RGB-D, a video or images"
             bad_value("PATH", expected, f"{source}, which is none of these")
         kind, unit, pairs = layout
+        if trajectory is not None and kind != "video":
+            bad_value("trajectory (--trajectory)", "left out where the capture is not a video", trajectory)
         whole = [(frame, camera) for frame, camera in pairs if frame.image.is_file()]
         frames = [_finished(frame, camera, K, fov) for frame, camera in whole]
     tracked = any(frame.E is not None for frame in frames)

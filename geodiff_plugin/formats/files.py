@@ -154,8 +154,10 @@ def read_npy(path: Path, name: str, expected: str) -> np.ndarray:
         value = np.load(path, allow_pickle=False)
     except Exception as error:  # a damaged head is parsed as Python, which may fail in any way
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        if "pickle" in reason:  # numpy's own words tell how to run what is in there
-            reason = "pickled objects, which are never loaded"
+        if "pickle" in reason:  # numpy's own words, of any other file too, tell how to run what is in there
+            with open(path, "rb") as file:
+                pickled = file.read(1) in (b"\x80", b"\x93")
+            reason = "pickled objects, which are never loaded" if pickled else "it is of another format"
         bad_value(name, expected, f"{path}, which numpy cannot load ({reason})", cure)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
         bad_value(name, expected, f"{path} without an array of real numbers", cure)

@@ -32,7 +32,7 @@ _DIAGONAL_35_MM = math.hypot(36.0, 24.0)
 _OTHER_LENS = 1.4
 #: Sides may be rounded by this share before an image counts as cropped.
 _SAME_SHAPE = 0.01
-CURES = "Give K (--fx --fy --cx --cy or --K), a field of view (--fov), or photographs with their EXIF."
+CURES = "Give K (--K), a field of view (--fov), or photographs with their EXIF."
 #: When OpenCV's search for a ray ends, and how near to its pixel a ray that was found comes back.
 UNTIL, TOLERANCE_PX = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-9), 0.01
 

@@ -91,6 +91,21 @@ def _holds_files(target: Path) -> bool:
     return target.is_dir() and any(path.name != PARTIAL for path in target.iterdir())
 
 
+def check_new(path: Path, overwrite: bool) -> Path:
+    """``check_out`` of a folder that is new or empty, unless it may be overwritten."""
+    target = check_out(path)
+    if _holds_files(target) and not overwrite:
+        cure = "Name another, or add --overwrite."
+        bad_value("--out", "a new or empty folder", f"{path}, which holds files", cure)
+    return target
+
+
+def check_new_file(path: Path, overwrite: bool) -> None:
+    """Refuse to replace an output file that nobody allowed to."""
+    if path.exists() and not overwrite:
+        bad_value("--out", "a new file", f"{path}, which exists", "Name another, or add --overwrite.")
+
+
 def free_folder(default: Path) -> Path:
     """A folder for a run that named none: ``default``, or ``default-2`` and so on where that is taken."""
     path = default
@@ -142,10 +157,7 @@ class OutFolder:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        self._target = check_out(self.path)
-        if _holds_files(self._target) and not self._overwrite:
-            cure = "Name another, or add --overwrite."
-            bad_value("--out", "a new or empty folder", f"{self.path}, which holds files", cure)
+        self._target = check_new(self.path, self._overwrite)
         for path in self._inputs if self._target.is_dir() else ():
             if any(path.exists() and path.samefile(e) for e in self._target.iterdir() if e.is_file()):
                 got = f"{self.path}, which holds {path}"  # and which the run may replace or delete

@@ -329,7 +329,9 @@ class GeometryGuidance:
         make = make_evidence if self.evidence_store is None else self.evidence_store.get
         evidence = []
         for i, (left_01, given) in enumerate(zip(lefts_01, self.inputs, strict=True)):
-            if not self._cropped:
+            rights = zip(given.views, given.rigs, strict=True)
+            checked = any(image_size(v.image_01) == size and (r.K_right == r.K_left).all() for v, r in rights)
+            if not (self._cropped or checked):  # by the constructor, with the right image
                 check_size_of(given.K_left, size, "K" if count == 1 else f"K[{i}]", "the left image")
             with WithinCores():  # ``prepare`` may be called outside of a guided call
                 evidence.append(make(left_01, given, self.config, needs_matches, self.measured_baseline))

@@ -101,7 +101,8 @@ def _read_image(
     rigs = tuple(Rig(K_left, K_right, pose) for K_right, pose in zip(K_rights, poses, strict=True))
     for v, (K_right, image) in enumerate(zip(K_rights, images, strict=True)):
         if not cropped:
-            K_name = f"{label.format('K')}[{_view(v, count)}]" if isinstance(K, tuple) else label.format("K")
+            of_view = isinstance(K, tuple) and not np.array_equal(K_right, K_left)
+            K_name = f"{label.format('K')}[{_view(v, count)}]" if of_view else label.format("K")
             check_size_of(K_right, image_size(image), K_name, "the right image")
         if isinstance(given[v], Image.Image):
             warn_of_other_lens(given[v], K_right, names[v])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ ALL_KNOWN = 0.999
 ENLARGED = 1.5
 #: Offset that makes a map in [0, 1] a stand-in for inverse depth, in which edges are relative steps.
 OFFSET = 0.25
+#: Product of the logs of width over height below which a wide map belongs to no tall image.
+UPRIGHT = -0.01
 
 
 class DepthMapPipeline(DirectMapPipeline):
@@ -93,6 +96,10 @@ class DepthMapPipeline(DirectMapPipeline):
             bad_value("depth_map", f"one map (h, w) for each of {len(image)} images", f"{len(maps)}")
         size, prepared = image_size(image), []
         for values, view in zip(maps, image.float().split(1), strict=True):
+            sides = values.shape[-1] / values.shape[-2], size[1] / size[0]
+            if math.log(sides[0]) * math.log(sides[1]) < UPRIGHT:
+                got = "{1}x{0} pixels".format(*values.shape[-2:])
+                bad_value("depth_map", f"of the image's {size[1]}x{size[0]} pixels", got, "Is it transposed?")
             filled, known = _filled(values.to(view.device))
             inside = F.interpolate(known.float(), size, mode="bilinear", antialias=True) > ALL_KNOWN
             prepared.append((_resized(filled, view / 2 + 0.5), inside))

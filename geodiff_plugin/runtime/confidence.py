@@ -81,11 +81,14 @@ def depth_confidence(
     return confidence
 
 
-def expected_error(depth_m: np.ndarray, K_left: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarray:
+def expected_error(
+    depth_m: np.ndarray, K_left: np.ndarray, poses: Sequence[np.ndarray], scale_spread: float = 0.0
+) -> np.ndarray:
     """Standard error of a matched depth by geometry alone, ``(H, W)`` metres: ``z^2 sigma_d / (f b)``.
 
     For a general pose ``(z - t_z)^2 sigma_d / |f (t_xy - r_xy t_z)|``, with the pixel's ray ``r`` and the
-    right camera's centre ``t``; the least over ``poses (4, 4)``. Rotations do not change it.
+    right camera's centre ``t``; the least over ``poses (4, 4)``. Rotations do not change it. A relative
+    error ``scale_spread`` of the poses' length adds to it.
     """
     rows, columns = np.indices(depth_m.shape)
     rays = (columns - K_left[0, 2]) / K_left[0, 0], (rows - K_left[1, 2]) / K_left[1, 1]
@@ -94,7 +97,7 @@ def expected_error(depth_m: np.ndarray, K_left: np.ndarray, poses: Sequence[np.n
         moved = [K_left[i, i] * (E[i, 3] - rays[i] * E[2, 3]) for i in (0, 1)]  # pixels times metres
         with np.errstate(divide="ignore"):
             best = np.minimum(best, (depth_m - E[2, 3]) ** 2 * MATCH_NOISE_PX / np.hypot(*moved))
-    return best
+    return np.hypot(best, scale_spread * depth_m)
 
 
 def reprojection(

@@ -243,7 +243,8 @@ def _why_order(run: Indicators) -> str:
     if run.inverse_fits or (run.order < MOST_EXCHANGED and varied):
         return (
             "Near and far are exchanged against the prior, or the inverse pose fits better: are left and "
-            "right swapped, is the sign of the baseline wrong, or is E world-to-camera?"
+            "right swapped, is the sign of the baseline wrong, is E world-to-camera, or is a prior map of "
+            "another space (--space)?"
         )
     if run.order < LEAST_ORDER and varied and not run.matched > MATCHED_ENOUGH:
         return (
@@ -262,12 +263,12 @@ def _why_matches(run: Indicators) -> str:
     if not (few or run.confidence < LEAST_CONFIDENCE or count > 1):
         return ""
     shares = [f"{100 * run.matched:.0f} % of the left image is matched"] if few or weak[0] else []
-    shares += [f"mean confidence is {run.confidence:.2f}"] if weak[1] else []
-    shares += [f"rank correlation with the prior is {run.order:.2f}"] if weak[2] and not shares else []
+    shares += [f"the mean confidence is {run.confidence:.2f}"] if weak[1] else []
+    shares += [f"the rank correlation with the prior is {run.order:.2f}"] if weak[2] and not shares else []
     return (
-        f"Only {' and '.join(shares)}. Likely causes: E along the wrong axis or with a wrong rotation, "
-        "images that are not rectified or whose lens is not corrected, K of another size, a mirrored image, "
-        "or views of different scenes or moments."
+        f"The views hardly agree: {' and '.join(shares)}. Likely causes: E along the wrong axis or with a "
+        "wrong rotation, images that are not rectified or whose lens is not corrected, K of another size, a "
+        "mirrored image, or views of different scenes or moments."
     )
 
 

@@ -47,6 +47,7 @@ FILES: dict[str, Any] = dict.fromkeys(EMPTY, "") | {
     "E-transposed.txt": E.T,
     "E-still.txt": np.eye(4),
     "large.json": NERF.replace("64", "128").replace("48", "96"),
+    "walk.json": NERF,
     # photographs
     "cut.png": lambda path: path.write_bytes(Path("left.png").read_bytes()[:1000]),
     "small.png": Image.new("RGB", (64, 31)).save,
@@ -72,6 +73,7 @@ FILES: dict[str, Any] = dict.fromkeys(EMPTY, "") | {
     "map.npy": MAP,
     "small.npy": MAP[:4, :4],
     "integers.npy": MAP.astype(int),
+    "earlier.webp": "a video",
 }
 
 

@@ -105,5 +105,5 @@ def test_a_video_has_metres_unless_a_report_says_that_there_are_none(geodiff, ma
     for unit in ("m", None):
         Path("depth.npy").write_bytes(Path(maps[0]).read_bytes())
         Path("report.json").write_text(json.dumps({"unit": unit}))
-        assert geodiff("video", ".", "--out", "depth.gif").code == 0
+        assert geodiff("video", ".", "--out", "depth.gif", "--overwrite").code == 0
     assert units == ["m", None]

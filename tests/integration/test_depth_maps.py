@@ -71,6 +71,7 @@ def test_several_images_each_with_a_map_of_its_size():
         (np.ones((9, 9)), "two different finite values"),
         (np.arange(18.0).reshape(2, 3, 3), "one map .* for each of 1 images"),
         ([np.ones((9, 9, 3))], "a map \\(h, w\\)"),
+        (np.arange(108.0).reshape(12, 9), "Is it transposed"),
         ("file.npy", "depth_map must be"),
     ],
 )

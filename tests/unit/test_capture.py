@@ -26,6 +26,7 @@ from geodiff_plugin.evaluation.frames import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
 from geodiff_plugin.plotting import grid
 from geodiff_plugin.pose.capture import SolvedCapture, candidate_pairs, solve_capture
+from geodiff_plugin.runtime.verdict import Indicators, judge
 from tests.cli.conftest import call
 from tests.unit.capture_room import FLIP, HALF, SIZE, K, perturbed, render, walk, write_transforms
 
@@ -243,7 +244,7 @@ def model(tmp_path, monkeypatch):
 
     found = replace(solved(), E=HALVED, E_given=HALVED, status="kept", points=solved().points / 2)
     monkeypatch.setattr(SOLVE, lambda *_, **__: found)
-    entries = {"unit": None, "K": K[None], "poses": (), "verdicts": (), "warnings": ()}
+    entries = {"unit": None, "K": K[None], "poses": (), "verdict": judge(Indicators()), "warnings": ()}
     depth = depth_by(lambda capture: length(capture.solve().E) / length(TRUE), **entries)
 
     def with_unit(capture, *args):
@@ -291,7 +292,8 @@ def test_frames_that_are_not_trusted_are_named_and_marked(model, monkeypatch):
     options, write, titles, lowest = model(), run._write_frame, list[str](), list[int]()
 
     def doubting(capture, options, loaded, item):
-        return write(capture, options, loaded, item) | {"trusted": [item.key != "f04"]}
+        verdict = {"status": "not trusted" if item.key == "f04" else "trusted", "reasons": ["Blurred."]}
+        return write(capture, options, loaded, item) | {"verdict": verdict}
 
     def noting(cells, names, **how):
         titles.extend(names)
@@ -306,9 +308,11 @@ def test_frames_that_are_not_trusted_are_named_and_marked(model, monkeypatch):
     monkeypatch.setattr("geodiff_plugin.plotting.grid", noting)
     report = run.capture_report(options)
     assert report["not_trusted"] == ["f04"]
-    assert "; NOT TRUSTED: f04 -> " in run.summary(report, options.out)
+    assert "; NOT TRUSTED: f04 (f04: Blurred.) -> " in run.summary(report, options.out)
     assert lowest == [0, 1, 0]  # seen by no other frame; of a doubted one that is no excuse
     assert titles == ["f02", "depth", "f04", "depth, not trusted", "f06", "depth"]
+    with pytest.raises(SystemExit):
+        run.run_capture(replace(options, strict=True))
 
 
 def test_a_frame_that_fails_is_named_and_the_rest_is_kept(model, tmp_path, monkeypatch, capsys):

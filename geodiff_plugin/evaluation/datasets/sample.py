@@ -170,13 +170,6 @@ def two_numbers(text: str, option: str) -> Numbers:
     return first, second
 
 
-def with_exposure(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
-    """Change the right view only: v in [0, 1] becomes ``gain * v ** gamma``, clipped, in 8 bits again."""
-    gain, gamma = change
-    right_01 = np.clip(gain * (sample.right / 255.0) ** gamma, 0.0, 1.0)
-    return replace(sample, name=name, right=np.rint(255 * right_01).astype(np.uint8))
-
-
 def with_drifted_rig(sample: StereoSample, change: Sequence[float], name: str) -> StereoSample:
     """The right camera has turned and its image moved, a homography; the name draws axis and sign."""
     degrees, px = change
@@ -219,7 +212,6 @@ def with_perturbed_poses(sample: StereoSample, change: Sequence[float], name: st
 
 #: Entry of ``SampleRef.files`` -> what it adds to the name, and how a sample becomes so.
 CHANGES: dict[str, tuple[str, Callable[[StereoSample, Any, str], StereoSample]]] = {
-    "right_exposure": ("gain{:g}-gamma{:g}", with_exposure),
     "perturbed": ("turn{:g}-shift{:g}", with_perturbed_poses),
     "drifted": ("drift{:g}-{:g}px", with_drifted_rig),
 }
