@@ -176,7 +176,8 @@ def share_figure(values: np.ndarray, label: str, top: float) -> Image.Image:
     return _figure(colour_share(values, top), SHARE_COLOURS, label, marks)
 
 
-def _as_picture(image: Any) -> Image.Image:
+def as_picture(image: Any) -> Image.Image:
+    """RGB of a picture, ``(H, W)`` or ``(H, W, 3)`` of uint8, bool or floats in [0, 1], or as it is."""
     if isinstance(image, Image.Image):
         return image.convert("RGB")
     values = np.asarray(image)
@@ -195,7 +196,7 @@ def grid(
 
     PIL images or arrays; a row, of ``columns`` (all, up to 4), is as high as its highest.
     """
-    pictures = [_as_picture(image) for image in images]
+    pictures = [as_picture(image) for image in images]
     if not pictures or len(titles) != len(pictures):
         bad_value("images", "one or more, each with a title", f"{len(pictures)}, {len(titles)} titles")
     columns, gap, head = columns or min(len(pictures), 4), 6, 24
@@ -222,7 +223,7 @@ def overview(
     """Left image in [0, 1], depth, any confidence and photometric error (not finite if unseen), 2 a row."""
     every = max(1, depth_m.shape[1] // (2 * CELL_WIDTH))
     depth = depth_figure(depth_m[::every, ::every], unit=unit)
-    left = _as_picture(left_01[::every, ::every].astype(np.float32))
+    left = as_picture(left_01[::every, ::every].astype(np.float32))
     beside = Image.new("RGB", depth.size, "white")  # as wide as a map with its bar: all have one scale
     beside.paste(left.resize((round(left.width * depth.height / left.height), depth.height)), (0, 0))
     cells = {"left image": beside, "depth": depth}

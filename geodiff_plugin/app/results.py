@@ -19,7 +19,7 @@ from geodiff_plugin.cli.depth import Job
 from geodiff_plugin.cli.outputs import cameras_of, pixels_of, single_map
 from geodiff_plugin.formats import make_cloud, write_glb
 from geodiff_plugin.formats.out import REPORT
-from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, ticks
+from geodiff_plugin.plotting import as_picture, colour_depth, colour_share, depth_range, ticks
 
 #: Pictures on the page are no larger than this; files to take home have every pixel.
 LARGEST_SIDE = 1600
@@ -138,7 +138,7 @@ def scale_of(job: Job) -> float:
 def picture(job: Job, name: str) -> np.ndarray | None:
     """``(h, w, 3)`` uint8 of ``photograph``, ``depth`` or ``confidence``; ``None`` without such a map."""
     if name == "photograph":
-        full = np.rint(np.clip(job.inputs.left, 0, 1) * 255).astype(np.uint8)
+        full = np.asarray(as_picture(job.inputs.left))
     elif name == "depth":
         full = colour_depth(depth_of(job))
     else:

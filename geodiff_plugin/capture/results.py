@@ -17,7 +17,7 @@ from geodiff_plugin.capture.agreement import DepthFrame, agreed, scene_poses, st
 from geodiff_plugin.capture.capture import Capture, choose_neighbours
 from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb, write_vertices
 from geodiff_plugin.formats.depth import write_depth_mm, write_depth_npy
-from geodiff_plugin.formats.out import atomic_path
+from geodiff_plugin.formats.out import atomic_path, write_text
 from geodiff_plugin.formats.sfm import write_colmap
 from geodiff_plugin.pose.capture import Observations
 
@@ -131,10 +131,6 @@ def write_results(
     return {"cloud_points": count}
 
 
-def _pixels(image_01: np.ndarray) -> np.ndarray:
-    return np.rint(image_01 * 255).astype(np.uint8)
-
-
 def _sheet(capture: Capture, out: Path, names: Sequence[str], doubted: Sequence[str]) -> None:
     """A picture of evenly chosen frames and their depth, in the colours of one range where they are alike."""
     shown = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, ON_SHEET).astype(int))]
@@ -156,8 +152,8 @@ def _video(capture: Capture, out: Path, names: Sequence[str]) -> None:
 
     def frames() -> Iterator[Image.Image]:
         for name, depth in zip(names, maps, strict=True):
-            halves = _pixels(capture.image(name)), plotting.colour_depth(depth, near, far)
-            yield ImageOps.pad(Image.fromarray(np.hstack(halves)), VIDEO_SIZE)
+            photo, drawn = plotting.as_picture(capture.image(name)), plotting.colour_depth(depth, near, far)
+            yield ImageOps.pad(Image.fromarray(np.hstack([np.asarray(photo), drawn])), VIDEO_SIZE)
 
     try:
         plotting.write_depth_video(out / "video.mp4", frames(), VIDEO_FPS)
@@ -235,15 +231,14 @@ def write_workspace(
         (folder / name).mkdir(parents=True, exist_ok=True)
     views, maps, colours = [], folder / "stereo", np.zeros(points.shape, np.uint8)
     for frame, observed in zip(frames, seen, strict=True):
-        picture = _pixels(image(frame.name))
-        size = picture.shape[1::-1]
-        Image.fromarray(picture).save(folder / "images" / f"{frame.name}.png")
-        u, v = np.rint(observed.px).astype(int).T.clip(0, np.array(size)[:, None] - 1)
-        colours[observed.point] = picture[v, u]
+        picture = plotting.as_picture(image(frame.name))
+        picture.save(folder / "images" / f"{frame.name}.png")
+        u, v = np.rint(observed.px).astype(int).T.clip(0, np.array(picture.size)[:, None] - 1)
+        colours[observed.point] = np.asarray(picture)[v, u]
         depth, file = np.where(kept(frame), frame.depth, 0)[..., None], f"{frame.name}.png.geometric.bin"
         write_map(maps / "depth_maps" / file, depth)
         write_map(maps / "normal_maps" / file, normals_of(frame.depth, frame.K))
-        views.append((f"{frame.name}.png", frame.K, frame.E, size))
+        views.append((f"{frame.name}.png", frame.K, frame.E, picture.size))
     rows, counts = np.unique(np.concatenate([observed.point for observed in seen]), return_counts=True)
     rows = rows[counts > 1]
     place = np.full(len(points), -1)
@@ -251,9 +246,8 @@ def write_workspace(
     shared = [place[observed.point] >= 0 for observed in seen]
     tracks = [(o.px[both], place[o.point[both]]) for o, both in zip(seen, shared, strict=True)]
     write_colmap(folder / "sparse", views, Cloud(points[rows], colours[rows]), tracks)
-    (maps / "fusion.cfg").write_text("".join(f"{file}\n" for file, *_ in views), encoding="utf-8")
-    pairs = "".join(f"{file}\n__auto__, 20\n" for file, *_ in views)
-    (maps / "patch-match.cfg").write_text(pairs, encoding="utf-8")
+    write_text(maps / "fusion.cfg", "".join(f"{file}\n" for file, *_ in views))
+    write_text(maps / "patch-match.cfg", "".join(f"{file}\n__auto__, 20\n" for file, *_ in views))
 
 
 def write_map(path: Path, values: np.ndarray) -> None:

@@ -215,7 +215,7 @@ def write_maps(
 def write_undistorted(folder: Path, image_01: np.ndarray, number: int = 1) -> str:
     """Write a view without its lens distortion, 1 for the left one, to which the depth belongs; its name."""
     name = "undistorted.png" if number == 1 else f"undistorted-{number}.png"
-    Image.fromarray(np.rint(image_01.clip(0, 1) * 255).astype(np.uint8)).save(folder / name)
+    plotting.as_picture(image_01).save(folder / name)
     return name
 
 

@@ -94,6 +94,7 @@ class Indicators:
     view_deg: float = math.nan  # horizontal field of view that K gives the left image
     prior_ratio: float = math.nan  # median of the depth over a metric prior's depth
     epipolar_px: float = math.nan  # median distance of matches from their epipolar lines, the worst view's
+    given_px: float = math.nan  # the same distance under the poses as given
     scale_spread: float = math.nan  # relative standard deviation of a refined pose's scale, if in metres
     off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
     doubts: tuple[str, ...] = ()  # warnings about the input, each of which forbids trust
@@ -191,7 +192,8 @@ def read_indicators(
         if evidence.points is not None:
             more |= _points_indicators(matches, evidence.points)
     if pose is not None:
-        more["epipolar_px"] = max((px for px in pose.residual_px if not math.isnan(px)), default=math.nan)
+        for name, residuals in (("epipolar_px", pose.residual_px), ("given_px", pose.residual_px_given)):
+            more[name] = max((px for px in residuals if not math.isnan(px)), default=math.nan)
         if pose.status == "mistaken":
             more["mistakes"] = tuple(sentence for sentence in pose.warnings if sentence != INVERSE)
     if evidence.points is not None:
@@ -308,10 +310,12 @@ def _reasons(run: Indicators) -> list[str]:
             f"Too few known depths to fix both scale and shift, {run.points}; give at least {LEAST_POINTS}."
         )
     if run.scale_spread > MOST_SCALE_SPREAD and run.points < LEAST_POINTS:
+        misses = f"E misses the matches by {run.given_px:.0f} px: is it of this pair? "
         reasons.append(
-            f"The scale of the refined pose is uncertain by {100 * min(run.scale_spread, 1):.0f} %: the "
-            "baseline and the depth of the scene under the given pose disagree. Give the measured distance "
-            f"of the cameras (--baseline, measured_baseline=True), or {LEAST_POINTS} known points or more."
+            f"{misses if run.given_px > EPIPOLAR_WRONG else ''}The scale of the refined pose is uncertain by "
+            f"{100 * min(run.scale_spread, 1):.0f} %: the baseline and the depth of the scene under the "
+            "given pose disagree. Give the measured distance of the cameras (--baseline, "
+            f"measured_baseline=True), or {LEAST_POINTS} known points or more."
         )
     if run.off_matches > OFF_MATCHES and run.points < LEAST_POINTS:
         reasons.append(

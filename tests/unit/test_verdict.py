@@ -60,7 +60,7 @@ def test_a_good_run_is_trusted_in_silence():
         ({"order": -0.9, "doubts": ("K is for another image.",)}, "depth: K is for another image"),
         ({"off_matches": 0.4}, "differs by 49 %"),
         ({"scale_spread": 0.16}, "uncertain by 16 %"),
-        ({"scale_spread": 0.16, "points": 2}, "uncertain by 16 %"),
+        ({"scale_spread": 0.16, "points": 2, "given_px": 15.2}, "depth: E misses the matches by 15 px"),
     ],
 )
 def test_reasons(signs, words):
