@@ -9,7 +9,7 @@ from typing import Any
 import gradio as gr
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.app.job import CAMERA_WAYS, ENDS, LIMITS, Priors, options_of
+from geodiff_plugin.app.job import CAMERA_WAYS, LIMITS, Priors, options_of
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.options import PRESETS, help_of
@@ -102,8 +102,7 @@ def _views() -> dict[str, Any]:
         for name, label in (("left", "Left photograph"), ("right", "Right photograph")):
             drawn[name] = photograph_field(label, name)
     ways = [(label, name) for name, label in CAMERA_WAYS.items()]
-    way = gr.Radio(ways, value="file", label="Where the cameras are", elem_id="way")
-    drawn["way"] = way
+    drawn["way"] = way = gr.Radio(ways, value="file", label="Where the cameras are", elem_id="way")
     calibration = gr.File(
         label="Calibration file, or one per camera (MVSNet, ROS, COLMAP)",
         file_count="multiple",
@@ -129,14 +128,15 @@ def _views() -> dict[str, Any]:
         shown = chosen == "file", chosen != "file", chosen == "numbers", chosen == "photographs"
         return [gr.update(visible=seen) for seen in shown]
 
-    def tap(before: str | None, event: gr.SelectData) -> str:
+    def tap(before: list[int], event: gr.SelectData) -> tuple[list[int], str]:
         """The pixels of both ends; a third tap begins anew."""
-        first = ENDS.findall(before or "")
-        return ", ".join([*(first if len(first) == 2 else []), *map(str, event.index)])
+        pixels = [*before, *event.index] if len(before) == 2 else list(event.index)
+        return pixels, ", ".join(map(str, pixels))
 
     way.change(show, way, [calibration, lens, cx_right, length], **QUICK)
-    drawn["left"].select(tap, ends, ends, **QUICK)
-    gr.on([drawn["left"].upload, drawn["left"].clear], lambda: "", outputs=ends, **QUICK)
+    tapped = gr.State([])  # at the server: a second tap that comes at once knows of the first
+    drawn["left"].select(tap, tapped, [tapped, ends], trigger_mode="multiple", **QUICK)
+    drawn["left"].change(lambda: ([], ""), outputs=[tapped, ends], **QUICK)
     return drawn
 
 

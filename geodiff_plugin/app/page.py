@@ -266,7 +266,7 @@ def _wire_panels(panels: SimpleNamespace, state: gr.State, points: gr.State, tab
         return shown
 
     measured = [points, panels.picture, panels.readings]
-    panels.picture.select(click, [state, points], measured, **QUICK)
+    panels.picture.select(click, [state, points], measured, trigger_mode="multiple", **QUICK)
     gr.on([panels.add.click, panels.pixel.submit], add, [state, points, panels.pixel], measured, **QUICK)
     panels.clear.click(lambda job: redraw(job, []), state, measured, **QUICK)
     shows = [tab, panels.scene, panels.points, panels.files]
