@@ -17,6 +17,8 @@ from geodiff_plugin.options import PRESETS, help_of
 PICTURE_HEIGHT = 190
 #: Of handlers that only the page itself calls.
 QUICK: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
+#: Of taps that come at once every one counts, after the one before.
+TAPS = QUICK | {"queue": True, "concurrency_limit": 1, "trigger_mode": "multiple"}
 #: Labels of the fields that hold a number or nothing.
 NUMBERS = {
     "fx": "fx, px",
@@ -103,19 +105,17 @@ def _views() -> dict[str, Any]:
             drawn[name] = photograph_field(label, name)
     ways = [(label, name) for name, label in CAMERA_WAYS.items()]
     drawn["way"] = way = gr.Radio(ways, value="file", label="Where the cameras are", elem_id="way")
-    calibration = gr.File(
+    drawn["calib"] = calibration = gr.File(
         label="Calibration file, or one per camera (MVSNet, ROS, COLMAP)",
         file_count="multiple",
         height=140,
         elem_id="calibration",
     )
-    drawn["calib"] = calibration
     with gr.Column(visible=False) as lens, gr.Row():
         for name, placeholder in (("fx", "focal"), ("fy", "as fx"), ("cx", "middle"), ("cy", "middle")):
             drawn[name] = _optional(name, placeholder)
     note = "cx + doffs; empty means the same cx as left"
-    cx_right = _optional("cx_right", "assumed as cx", info=note, visible=False)
-    drawn["cx_right"] = cx_right
+    drawn["cx_right"] = cx_right = _optional("cx_right", "assumed as cx", info=note, visible=False)
     drawn["baseline"] = _optional("baseline", "as the calibration file says")
 
     with gr.Row(visible=False) as length:
@@ -134,8 +134,8 @@ def _views() -> dict[str, Any]:
         return pixels, ", ".join(map(str, pixels))
 
     way.change(show, way, [calibration, lens, cx_right, length], **QUICK)
-    tapped = gr.State([])  # at the server: a second tap that comes at once knows of the first
-    drawn["left"].select(tap, tapped, [tapped, ends], trigger_mode="multiple", **QUICK)
+    tapped = gr.State([])  # at the server, where a second tap knows of the first
+    drawn["left"].select(tap, tapped, [tapped, ends], **TAPS)
     drawn["left"].change(lambda: ([], ""), outputs=[tapped, ends], **QUICK)
     return drawn
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.app import look, results
-from geodiff_plugin.app.form import EXAMPLES, QUICK, Form, build_form
+from geodiff_plugin.app.form import EXAMPLES, QUICK, TAPS, Form, build_form
 from geodiff_plugin.app.job import Priors, Stopped, run_job
 from geodiff_plugin.cli.depth import Job
 from geodiff_plugin.cli.options import DepthOptions
@@ -266,7 +266,7 @@ def _wire_panels(panels: SimpleNamespace, state: gr.State, points: gr.State, tab
         return shown
 
     measured = [points, panels.picture, panels.readings]
-    panels.picture.select(click, [state, points], measured, trigger_mode="multiple", **QUICK)
+    panels.picture.select(click, [state, points], measured, **TAPS)
     gr.on([panels.add.click, panels.pixel.submit], add, [state, points, panels.pixel], measured, **QUICK)
     panels.clear.click(lambda job: redraw(job, []), state, measured, **QUICK)
     shows = [tab, panels.scene, panels.points, panels.files]
