@@ -183,12 +183,11 @@ class Capture:
     def check_points(self, points: str, scaled: bool = False) -> None:
         """``InputError`` where no frame has such known depths, or they will not be in metres (``scaled``)."""
         check_choice(points, "points", POINTS)
-        needed = {"model": "points of a COLMAP model", "depth": "depth maps that the capture names"}
-        if points not in needed:
-            return
-        if all((frame.points if points == "model" else frame.depth) is None for frame in self.files.frames):
-            bad_value("points (--points)", needed[points], f"{points!r} for a {self.files.kind} without")
-        if self.unit is None and not scaled:
+        of = {"model": "points", "depth": "depth"}.get(points)
+        if of and all(getattr(frame, of) is None for frame in self.files.frames):
+            got = f"{points!r} for a {self.files.kind} without"
+            bad_value("points (--points)", "known depths that the capture has", got)
+        if of and self.unit is None and not scaled:
             cure = "Give --metres-per-unit, --known-length or --distance."
             bad_value("points (--points)", "of a capture whose scale is known", "one without a unit", cure)
 

@@ -24,7 +24,7 @@ from geodiff_plugin._threads import WithinCores, available_cores
 from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.capture.results import ALONE, save_alone, write_agreement, write_results
 from geodiff_plugin.cli.depth import load_guided_prior
-from geodiff_plugin.cli.options import CaptureOptions
+from geodiff_plugin.cli.options import OF_SCALE, CaptureOptions
 from geodiff_plugin.cli.outputs import plain, single_map, verdict_report, write_maps
 from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, collected_warnings, say
 from geodiff_plugin.formats.depth import read_map
@@ -38,7 +38,6 @@ from geodiff_plugin.types import MetricDepthOutput
 POSES_FILE, JOURNAL = "poses.npz", "frames.jsonl"
 #: What the poses depend on, and beside them the depth of a frame.
 OF_POSES = ("poses", "k", "fov", "trajectory")
-OF_SCALE = ("metres_per_unit", "known_length", "distance")
 OF_FRAME = ("neighbours", "points", *OF_SCALE, "prior", "prior_map", "space", "steps", "seed")
 #: Memory that one process of the bundled prior takes at 640x480, bytes; what a larger prior takes is unknown.
 PROCESS_BYTES = 1.5e9
@@ -244,9 +243,11 @@ def _help(options: CaptureOptions, items: list[Item], factor: float | None, inde
     """Another process of the same run, which takes frames that nobody has taken."""
     os.environ.update(RANK=str(index), WORLD_SIZE=str(count), LOCAL_RANK="0")
     options = replace(options, overwrite=False, quiet=True)
-    capture = open_capture(options)
-    solved_poses(capture, options, factor)
-    _work(capture, options, items, count)
+    with collected_warnings(lambda _: None):  # the first process has told them
+        capture = open_capture(options)
+        solved_poses(capture, options, factor)
+    with collected_warnings():
+        _work(capture, options, items, count)
 
 
 def capture_report(options: CaptureOptions) -> Record:

@@ -27,6 +27,8 @@ WAYS = {
     "parameters": (*PARAMETERS[:-1], "cx_right"),
     "--fov": ("fov",),
 }
+#: The ways to give the scale of a capture.
+OF_SCALE = ("metres_per_unit", "known_length", "distance")
 #: Fields that hold paths, but not of files that are read beside the photographs.
 PHOTOGRAPHS_AND_OUT = ("left", "right", "view", "out")
 
@@ -286,7 +288,7 @@ class CaptureOptions(PriorOptions):
 
     def __post_init__(self) -> None:
         check_options(self)
-        ways = ("metres_per_unit", "known_length", "distance")
-        if sum(getattr(self, way) is not None for way in ways) > 1:
-            several = "more of --metres-per-unit, --known-length, --distance"
-            bad_value("the scale", "given in one way", several)
+        if sum(getattr(self, way) is not None for way in OF_SCALE) > 1:
+            bad_value(
+                "the scale", "given in one way", "more of --metres-per-unit, --known-length, --distance"
+            )
