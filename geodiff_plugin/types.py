@@ -90,16 +90,19 @@ class CameraView(NamedTuple):
 
 @dataclass(frozen=True)
 class StepReport:
-    """Report of one guided denoising step, with one entry per sample of the batch."""
+    """Report of one round of a guided denoising step, with one entry per sample of the batch.
+
+    The loss is that before the updates of the round; a round without updates computes none.
+    """
 
     step: int  # index of the step in the schedule, from 0
     timestep: float  # the scheduler's
-    loss: torch.Tensor  # (B,) total loss at the start of the step's updates
-    terms: dict[str, torch.Tensor]  # (B,) unweighted value of every term, by name
     s_hat: torch.Tensor  # (B,) raw scale before softplus, after the step
     t_hat: torch.Tensor  # (B,) raw shift likewise
     g_s: torch.Tensor  # (B,) global scale in use, metres
-    visible_fraction: torch.Tensor  # (B,) share of the pixels that a right view sees; 0 without one
+    loss: torch.Tensor | None = None  # (B,) total
+    terms: dict[str, torch.Tensor] = field(default_factory=dict)  # (B,) unweighted value of each, by name
+    visible_fraction: torch.Tensor | None = None  # (B,) pixels that a right view sees; 0 without a view
 
 
 @dataclass
@@ -129,7 +132,7 @@ class MetricDepthOutput(BaseOutput):
         prior_error: ``(N,)`` error of the prior alone, standard deviation in log depth, estimated from
             left-out matches or points; ``None`` where none were compared.
         K: ``(N, 3, 3)`` intrinsics of the output grid, pixels.
-        history: one ``StepReport`` per guided step and batch chunk.
+        history: one ``StepReport`` per round of a guided step and batch chunk.
         poses: one ``PoseReport`` per image with right views.
         extras: further maps of the prior by name (GeoWizard's ``"normals"``), but for their channels.
         verdicts: one ``runtime.verdict.Verdict`` per image: whether the depth can be trusted, and why not.

@@ -157,8 +157,11 @@ class Trajectory:
             matches = replace(self.matches, confidence=self.kept * self.matches.confidence)
         return self.objective(x, affine, self._affine_start, z0, anchor, matches, self.points, self.hidden)
 
-    def report(self, loss: Loss) -> None:
+    def report(self, loss: Loss | None) -> None:
         """Append a ``StepReport``; tensors stay on their device, so nothing waits for it."""
-        terms = {name: value.detach() for name, value in loss.terms.items()}
-        state = self.affine.s_hat, self.affine.t_hat, self.affine.g_s
-        self.history.append(StepReport(*self.step, loss.total.detach(), terms, *state, loss.visible_fraction))
+        report = StepReport(*self.step, self.affine.s_hat, self.affine.t_hat, self.affine.g_s)
+        if loss is not None:
+            terms = {name: value.detach() for name, value in loss.terms.items()}
+            seen = loss.visible_fraction
+            report = replace(report, loss=loss.total.detach(), terms=terms, visible_fraction=seen)
+        self.history.append(report)

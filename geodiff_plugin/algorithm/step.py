@@ -109,30 +109,25 @@ def guided_step(
 ) -> tuple[Tensor, Tensor, bool]:
     """Run the rounds of one denoising step.
 
-    Returns the change of the latent, the latest relative map, and whether the moved latent decodes to it.
+    Returns the change of the latent, the latest relative map, and whether the result
+    starts from this map without another decode.
     """
     z, anchor, x, is_current = estimate.latent, None, None, False
     for k, (corrects, updates) in enumerate(rounds):
-        is_current = corrects and not updates
+        is_current, before = corrects and not updates, None
         if corrects:
             is_result = is_last and k == len(rounds) - 1 and not updates
             moved, x = corrected_step(state, estimate, z, is_result)
             anchor = moved if anchor is None else anchor + moved - z
             z = moved
-        if anchor is None:
-            anchor = estimate.z0(z).detach()
-        losses = []
-        for i in range(updates):
-            z, x, loss = gradient_step(state, estimate, z, anchor, is_first=i == 0)
-            losses.append(loss)
-        if not updates:
+        elif not updates:
             z0 = estimate.z0(z).detach()
-            if not corrects:
-                x = estimate.decode(z0).detach()
-                state.prepare(x, z0)
-                state.find_hidden(x)
-            assert x is not None  # corrected, or decoded just now
-            losses.append(state.loss(x, state.affine, z0, anchor))
-        state.report(losses[0])
+            x = estimate.decode(z0).detach()
+            state.prepare(x, z0)
+        for i in range(updates):
+            anchor = estimate.z0(z).detach() if anchor is None else anchor
+            z, x, loss = gradient_step(state, estimate, z, anchor, is_first=i == 0)
+            before = before or loss
+        state.report(before)
     assert x is not None  # there is one round at least
     return (z - estimate.latent).detach(), x, is_current

@@ -67,7 +67,7 @@ def test_writes_everything(geodiff, command):
     assert answer.code == 0, answer.err
     assert names_in(out) == FILES | CONFIDENCE
     assert answer.out.count("\n") == 1 and " m to " in answer.out and "geodiff-out/" in answer.out
-    assert "loss=" in answer.err
+    assert "guided steps" in answer.err
     depth_m, report = np.load(out / "depth.npy"), report_of()
     assert depth_m.dtype == np.float32 and depth_m.shape == (48, 64) and (depth_m > 0).all()
     millimetres = np.asarray(Image.open(out / "depth_mm.png"))
