@@ -15,6 +15,8 @@ LONG_BASELINE_M, FAR_SCENE_M, FAR_POINTS_M = 20.0, 200.0, 100.0
 NEAR_BORDER, OFF_MIDDLE, NEARLY_ALIKE = 0.2, 0.12, 0.08
 #: Pixels are about square; a stretched image has them up to 16:9, and a mistyped digit beyond.
 STRETCHED = 2.0
+#: Focal length over width below which a lens without distortion would see more than 150 degrees.
+NORMALISED = 0.134
 SCALED_K = "with s = new size / old size take fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy"
 POSE = "E is the 4x4 pose of the right camera in the left camera's frame, [[R, t], [0, 1]], t in metres."
 
@@ -68,6 +70,9 @@ def check_calibrated_size(
 def check_size_of(K: np.ndarray, size: tuple[int, int], name: str, image: str) -> None:
     """Refuse a camera matrix that cannot belong to an image ``(H, W)``, and warn of a doubtful one."""
     height, width = size
+    if K[0, 0] < NORMALISED * width:
+        cure = "Is it normalised? Multiply its first row by the width and its second by the height."
+        bad_value(name, f"in pixels of {image} of {width}x{height}", f"fx {K[0, 0]:g}", cure)
     check_intrinsics_fit(K, width, height, name, image)
     x, y = K[0, 2] / width, K[1, 2] / height
     place = ""

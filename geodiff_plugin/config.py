@@ -317,7 +317,7 @@ PAPER = DEFAULT.changed(
     crisp=False,
 )
 
-#: For rigs and videos: coarser matches, one correction, the rig's pose as it is.
+#: For rigs and videos: coarser matches, a fit at the end alone, the rig's pose as it is.
 FAST = DEFAULT.changed(sweep_pixels=80_000, corrections=1, min_steps=1, pose="given")
 
 #: Scale and shift of the search alone.

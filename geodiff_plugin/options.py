@@ -80,7 +80,7 @@ class PriorOptions:
 
     prior: str = declare("bundled", "'bundled', a hub id or a folder; KEY:folder says which kind.")
     space: str | None = declare(
-        None, "Space of the prior's map, if its folder says none: " + ", ".join(SPACES) + ".", choices=SPACES
+        None, "Space of the prior's map, in place of its folder's: " + ", ".join(SPACES) + ".", choices=SPACES
     )
     steps: int | None = declare(None, "Denoising steps; default: the prior's, at least 4.", low=1, high=1000)
     seed: int = declare(0, "Seed of the noise.", low=0, high=2**63 - 1)

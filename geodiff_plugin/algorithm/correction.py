@@ -40,6 +40,8 @@ RESIDUAL_CAUCHY = 2.5
 BLOCK = 0.08
 #: Bounds of the error that is assumed of a prior, in log depth.
 LEAST_ERROR, MOST_ERROR = 0.01, 0.5
+#: Of fewer points the measured error is partly chance: the fewer, the nearer to the largest it is taken.
+FEW_POINTS = 100
 #: Steps in brightness and in log depth across which a correction does not spread.
 IMAGE_EDGE, DEPTH_EDGE = 0.1, 0.1
 #: Share of the smoothness that remains across any edge.
@@ -219,7 +221,9 @@ def prior_error(
     black = ((rows[:, None] + columns[None]) % 2).to(observed.residual.dtype)
     first = _spread(observed.residual, observed)
     predicted = [_stiff(observed, observed.weight * colour, first, config) for colour in (black, 1.0 - black)]
-    return _spread(torch.where(black > 0, predicted[1], predicted[0]) - observed.residual, observed)
+    error = _spread(torch.where(black > 0, predicted[1], predicted[0]) - observed.residual, observed)
+    share = ((observed.weight > 0).float().sum((1, 2, 3), keepdim=True) / FEW_POINTS).clamp_max(1.0)
+    return error**share * MOST_ERROR ** (1.0 - share)
 
 
 @torch.no_grad()

@@ -12,17 +12,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+import geodiff_plugin.matching as matching
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.geometry import PlaneRays, image_size, plane_rays, resize_image
-from geodiff_plugin.matching import (
-    CostVolume,
-    Matches,
-    build_cost_volume,
-    inverse_pose_preferred,
-    match_volume,
-    points_to_matches,
-    to_grid,
-)
+from geodiff_plugin.matching import CostVolume, Matches
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.scale.points import RELIABLE, reliable_matches
 from geodiff_plugin.types import CameraView, PoseReport
@@ -68,19 +61,21 @@ def prepare_evidence(
     ``needs_matches``: the volume is aggregated and checked against each view. ``pose`` reports how the poses
     fit and whether they were refined.
     """
-    left, further, K = to_grid(left_01, views, K_left, config.sweep_pixels)
+    left, further, K = matching.to_grid(left_01, views, K_left, config.sweep_pixels)
     volume, matches, known_points = None, None, None
     warnings: list[str] = [] if pose is None else list(pose.warnings)
     if views and (config.search == "volume" or needs_matches):
-        volume = build_cost_volume(left_01, views, K_left, depth_range=config.depth_range, config=config)
+        pair = left_01, views, K_left
+        volume = matching.build_cost_volume(*pair, depth_range=config.depth_range, config=config)
         if needs_matches:
-            matches = match_volume(volume)
-        if inverse_pose_preferred(left_01, views, K_left, matches):
+            matches = matching.match_volume(volume)
+        if matching.inverse_pose_preferred(*pair, matches):
             warnings.append(INVERSE)
     if points is not None:
-        known_points, left_out = points_to_matches(points, K_left, image_size(left_01), image_size(left))
+        sizes = image_size(left_01), image_size(left)
+        known_points, left_out = matching.points_to_matches(points, K_left, *sizes)
         if left_out:
-            warnings.append(f"{left_out} points lie behind the left camera or outside its image: left out.")
+            warnings.append(f"{left_out} points outside the left image are left out: is their frame right?")
     reliable = None if matches is None else reliable_matches(matches)
     # Read back from the device now, so that no step waits for it.
     if volume is not None:

@@ -1,4 +1,4 @@
-"""``Schedule``: what a guided call does at every denoising step, decided once; ``print`` shows it."""
+"""``Schedule``: what a guided call does at every denoising step, decided once."""
 
 from __future__ import annotations
 
@@ -30,20 +30,6 @@ class Schedule:
     def moves_at(self, step: int) -> bool:
         """Whether guidance changes the latent at this step."""
         return self.moves and any(r.corrects or r.updates for r in self.steps[step])
-
-    def __str__(self) -> str:
-        lines = []
-        for i, rounds in enumerate(self.steps):
-            actions = [
-                " and ".join(
-                    ["correct"] * r.corrects + [f"update {r.updates} x"] * (r.updates > 0)
-                    or ["settle the scale"]
-                )
-                for r in rounds
-            ]
-            last = ", last" if self.is_last(i) else ""
-            lines.append(f"step {i + 1}: {'; '.join(actions) or 'leave'}{last}")
-        return "\n".join(lines)
 
 
 def count_steps(wanted: int, requested: int | None, most: int | None) -> tuple[int, int]:

@@ -52,6 +52,7 @@ class Capture:
         self.names = [frame.name for frame in files.frames]
         self.unit = files.unit
         self.solved: SolvedCapture | None = None
+        self._way: str | None = None  # how it was solved
         self._video: VideoReader | None = None
 
     @classmethod
@@ -107,16 +108,18 @@ class Capture:
         Es = [frame.E for frame in self.files.frames]
         return None if any(E is None for E in Es) else np.stack([E for E in Es if E is not None])
 
-    def solve(self, poses: str = "refined", *, threads: int | None = None) -> SolvedCapture:
-        """Poses of all frames (extra ``capture``), ``"refined"`` or ``"given"``; made once and kept.
+    def solve(self, poses: str | None = None, *, threads: int | None = None) -> SolvedCapture:
+        """Poses of all frames (extra ``capture``), ``"refined"``, the default, or ``"given"``.
 
-        ``threads`` are for features, matching and adjustment; all cores by default.
+        They are kept until the others are asked for. ``threads`` are for features, matching and adjustment,
+        all cores by default.
 
         Raises:
             InputError: pycolmap is missing; frames without poses that cannot be connected.
         """
-        check_choice(poses, "poses", ("refined", "given"))
-        if self.solved is None:
+        check_choice(poses or "refined", "poses", ("refined", "given"))
+        if self.solved is None or poses not in (None, self._way):
+            self._way = poses or "refined"
             images, frames = map(self.image, self.names), self.files.frames
             self.solved = solve_capture(
                 (np.rint(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) * 255).astype(np.uint8) for x in images),
@@ -125,7 +128,7 @@ class Capture:
                 [frame.size for frame in frames],
                 threads=threads or available_cores(),
                 names=self.names,
-                poses=poses,
+                poses=self._way,
             )
         return self.solved
 

@@ -92,7 +92,7 @@ class _Demo:
 @dataclass(frozen=True, kw_only=True)
 class _Info:
     prior: str | None = declare(None, "Describe this prior as well.")
-    space: str | None = declare(None, "Space of its map, if its folder does not say.", choices=SPACES)
+    space: str | None = declare(None, "Space of its map, in place of what its folder says.", choices=SPACES)
     knobs: bool = declare(False, "List the knobs of the guidance instead: default, range, what each does.")
 
 

@@ -33,6 +33,7 @@ from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, check_new
 from geodiff_plugin.pose.capture import Observations, SolvedCapture
 from geodiff_plugin.runner import BROKEN, Item, Journal, Runner, fingerprint, this_process
 from geodiff_plugin.runtime.machine import pick_device
+from geodiff_plugin.runtime.verdict import UNTESTED
 from geodiff_plugin.types import MetricDepthOutput
 
 POSES_FILE, JOURNAL = "poses.npz", "frames.jsonl"
@@ -328,5 +329,5 @@ def summary(report: Record, out: Path) -> str:
     if doubted := report["not_trusted"]:
         line += f"; NOT TRUSTED: {', '.join(doubted[:9])}{' ...' if doubted[9:] else ''}"
         reasons = next(f["verdict"]["reasons"] for f in report["frames"] if f["frame"] == doubted[0])
-        line += f" ({doubted[0]}: {' '.join(reasons[:1]) or 'neither matches nor known depths test it'})"
+        line += f" ({doubted[0]}: {' '.join(reasons[:1]) or UNTESTED})"
     return f"{line} -> {out}/"

@@ -7,9 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
-from typing import Any
+from functools import partial
 
 import torch
 
@@ -23,11 +21,11 @@ from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
-from geodiff_plugin.runtime.machine import PeakMemory, pick_device, timed
+from geodiff_plugin.runtime.machine import pick_device, timed
 
 CELL_WIDTH = 360
-#: Name in the table -> gradient of the guidance, ``None`` for the plain pipeline.
-VARIANTS = {"plain": None, "guided, denoised gradient": "denoised", "guided, full gradient": "full"}
+#: Calls of which the fastest counts.
+CALLS = 3
 
 
 def run_demo(options: DepthOptions, out: OutFolder) -> None:
@@ -55,43 +53,22 @@ def run_demo(options: DepthOptions, out: OutFolder) -> None:
     print(f"Open {out.path / 'comparison.png'} first: prior, guided depth and truth side by side.")
 
 
-def measure(gradient: str | None, device_name: str, repeats: int = 2, **knobs: Any) -> tuple[float, int]:
-    """Seconds of one call of the bundled prior on the demo pair, and the most bytes that it took.
-
-    The first call of a process tells its memory, since what is freed later stays with the allocator; the
-    fastest of ``repeats`` more, if any, tells the seconds.
-    """
-    device, pair = torch.device(device_name), read_demo_pair()
-    pipe = load_guided_prior("bundled", device)
-    cameras = (pair.rig.K_left, pair.rig.K_right), pair.rig.E
-    guidance = GeometryGuidance(pair.right, *cameras, gradient=gradient or "denoised", **knobs)
-    options: dict[str, Any] = {"num_inference_steps": guidance.denoising_steps(None, 1)}
-    if gradient is not None:
-        options["guidance"] = guidance
-
-    def call() -> None:
-        pipe(pair.left, generator=torch.Generator("cpu").manual_seed(0), **options)
-
-    with PeakMemory(device) as memory:
-        first = timed(call, device)
-    return min([timed(call, device) for _ in range(repeats)], default=first), memory.peak_bytes
-
-
 def run_bench(device: str) -> None:
-    """Print the table, every row measured in a process of its own, and where a command's time goes."""
-    place, costs = pick_device(device), []
+    """Print seconds of a plain and of a guided call, and where the time of a command goes."""
+    place, pair = pick_device(device), read_demo_pair()
     where = f"{place}, {torch.get_num_threads()} threads, torch {torch.__version__}"
-    table = new_table(("", "seconds", "peak MB", "time x", "memory x"))
-    for name, gradient in VARIANTS.items():
-        with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
-            costs.append(fresh_process.submit(measure, gradient, str(place)).result())
-        seconds, peak_bytes = costs[-1]
-        ratios = f"{seconds / costs[0][0]:.2f}", f"{peak_bytes / max(costs[0][1], 1):.2f}"
-        table.add_row(name, f"{seconds:.2f}", f"{peak_bytes / 1e6:.0f}", *ratios)
+    pipe, cameras = load_guided_prior("bundled", place), (pair.rig.K_left, pair.rig.K_right)
+    guidance = GeometryGuidance(pair.right, cameras, pair.rig.E)
+    table, fastest = new_table(("", "seconds", "time x")), list[float]()
+    for name, given in (("plain", None), ("guided", guidance)):
+        steps = guidance.denoising_steps(None, 1)
+        call = partial(pipe, pair.left, guidance=given, num_inference_steps=steps)
+        fastest.append(min(timed(call, place) for _ in range(CALLS)))
+        table.add_row(name, f"{fastest[-1]:.2f}", f"{fastest[-1] / fastest[0]:.2f}")
     left, right, calib = (str(DEMO_PAIR_FOLDER / name) for name in ("left.png", "right.png", "calib.txt"))
     with tempfile.TemporaryDirectory() as folder:
-        options = ["--calib", calib, "--device", str(place), "--json", "--quiet", "--out", f"{folder}/out"]
-        words = [sys.executable, "-m", "geodiff_plugin", "depth", left, right, *options]
+        flags = ["--calib", calib, "--device", str(place), "--json", "--quiet", "--out", f"{folder}/out"]
+        words = [sys.executable, "-m", "geodiff_plugin", "depth", left, right, *flags]
         started = time.perf_counter()
         answer = subprocess.run(words, check=True, capture_output=True, text=True)
         whole = time.perf_counter() - started

@@ -25,6 +25,7 @@ from geodiff_plugin.formats.out import REPORT, check_new_file, write_text
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.runtime.confidence import expected_error
 from geodiff_plugin.runtime.machine import versions
+from geodiff_plugin.runtime.verdict import UNTESTED
 from geodiff_plugin.types import MetricDepthOutput
 
 #: Benchmarks by name, and where their files lie below the folder of a submission.
@@ -168,7 +169,7 @@ def summary_line(report: dict[str, Any], where: str) -> str:
         of = "baselines" if report.get("estimated_pose") else "the calibration's lengths"
         metres += f", in {of} (no unit)"
     if verdict["status"] != "trusted":
-        reason = verdict["reasons"][0] if verdict["reasons"] else "neither matches nor known depths test it."
+        reason = verdict["reasons"][0] if verdict["reasons"] else f"{UNTESTED}."
         return f"{verdict['status'].upper()}: {reason} (Unconfirmed: {metres}; {end})"
     signs, error, prior_scale = verdict["signs"], report.get("expected_error_median_m"), report["prior_scale"]
     trusted = ["trusted if what is assumed holds" if report.get("assumed") else "trusted"]

@@ -50,6 +50,7 @@ def answered(pred_m: Map) -> Map:
 
 def counted(truth_m: Map, valid: Map, cap_m: float | None = None) -> Map:
     """``(H, W)`` bool: pixels whose truth is known and between ``FLOOR_M`` and any cap; at least one."""
+    valid = np.asarray(valid, bool)  # integers would choose rows
     kept = valid & np.isfinite(truth_m) & (truth_m > FLOOR_M) & (True if cap_m is None else truth_m < cap_m)
     if not kept.any():
         bad_value("truth", "known for at least one pixel", "no valid pixel", "Check the mask and the cap.")
@@ -81,7 +82,8 @@ def evaluate_disparity(
 
     ``step_px`` lies between neighbouring values of the truth: a metric with a finer threshold is ``None``.
     """
-    error, truth = np.abs(pred_px - truth_px)[valid], truth_px[valid]
+    kept = np.asarray(valid, bool)
+    error, truth = np.abs(pred_px - truth_px)[kept], truth_px[kept]
     filled = np.isfinite(error)
     error, truth = error[filled], truth[filled]
     return {
@@ -103,7 +105,11 @@ def ause(pred_m: Map, truth_m: Map, valid: Map, uncertainty: Map | None, steps: 
     ``ValueError`` where no pixel has truth, prediction and uncertainty.
     Source: Ilg et al., "Uncertainty Estimates and Multi-Hypotheses Networks for Optical Flow", S5.
     """
-    kept = valid & answered(pred_m) & (True if uncertainty is None else np.isfinite(uncertainty))
+    kept = (
+        np.asarray(valid, bool)
+        & answered(pred_m)
+        & (True if uncertainty is None else np.isfinite(uncertainty))
+    )
     if not kept.any():
         bad_value("uncertainty", "finite for at least one pixel with truth and prediction", "none")
     truth = np.asarray(truth_m, np.float64)[kept]

@@ -82,9 +82,9 @@ def make_cloud(
 ) -> Cloud:
     """The points of a depth map, one a pixel, row by row; none where it is not finite or not above 0.
 
-    ``depth_m`` is ``(H, W)`` metres along z, ``image_01`` ``(H, W, 3)`` in [0, 1], ``K`` ``(3, 3)`` pixels of
-    this grid, ``valid`` ``(H, W)`` boolean. A pixel on the principal point at 2 m is (0, 0, 2). Raises
-    ``ValueError`` for shapes that do not fit, or a K that is none.
+    ``depth_m`` is ``(H, W)`` metres along z, ``image_01`` ``(H, W, 3)`` in [0, 1] or uint8, ``K`` ``(3, 3)``
+    pixels of this grid, ``valid`` ``(H, W)`` boolean. A pixel on the principal point at 2 m is (0, 0, 2).
+    Raises ``ValueError`` for shapes that do not fit, or a K that is none.
     """
     return Cloud(*map(np.concatenate, zip(*_cloud_strips(depth_m, image_01, K, valid), strict=True)))
 
@@ -102,7 +102,12 @@ def _cloud_strips(
         use = _usable(z, None if valid is None else valid[rows])
         v, u = np.nonzero(use)
         points = np.stack([u, v + rows.start, np.ones_like(u)], axis=-1) @ unproject * z[use][:, None]
-        yield points, np.rint(np.clip(image_01[rows][use], 0.0, 1.0) * 255.0).astype(np.uint8)
+        yield points, _bytes(image_01[rows][use])
+
+
+def _bytes(image: np.ndarray) -> np.ndarray:
+    """Colours in 8 bits, of uint8 or of floats in [0, 1]."""
+    return image if image.dtype == np.uint8 else np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def make_mesh(
@@ -134,7 +139,7 @@ def make_mesh(
     whole = cut[:-1, :-1] == 0
     faces = np.concatenate([np.stack(part, -1)[whole] for part in ((a, c, b), (b, c, d))])
     uv = np.stack([(u + 0.5) / sides[1], 1.0 - (v + 0.5) / sides[0]], -1)
-    texture = Image.fromarray(np.rint(np.clip(image_01, 0.0, 1.0) * 255.0).astype(np.uint8))
+    texture = Image.fromarray(_bytes(np.asarray(image_01)))
     texture.format = "JPEG"  # makes trimesh store it as one
     material = PBRMaterial(baseColorTexture=texture, metallicFactor=0.0, doubleSided=True)
     visual = TextureVisuals(uv=uv.reshape(-1, 2), material=material)

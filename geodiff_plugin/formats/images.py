@@ -123,7 +123,7 @@ def _hwc(value: Any, name: str) -> np.ndarray:
         channels, shape = -1, "(H, W, 3) or (H, W)"
         turn = "numpy images end in channels: value.transpose(1, 2, 0)."
     if value.ndim != 3 or value.shape[channels] not in CHANNELS:
-        cures = {2: "Add a channel axis: value[None].", 3: turn, 4: "Take one image of the batch: value[0]."}
+        cures = {2: "Add a channel axis: value[None].", 3: turn, 4: "A batch is a list: list(value)."}
         expected = f"an image of shape {shape}, of 1, 3 or 4 channels"
         bad_value(name, expected, f"shape {tuple(value.shape)}", cures.get(value.ndim, ""))
     if isinstance(value, torch.Tensor):

@@ -319,7 +319,8 @@ class GeometryGuidance:
         """The ``Evidence`` of every left image ``(N, 3, H, W)`` in [0, 1], native, on the device to use."""
         count, size = lefts_01.shape[0], image_size(lefts_01)
         if len(self.inputs) != count:
-            name, kind = ("right", "images") if self.rights else ("points", "entries")
+            images = "images (a tuple for several right views)"
+            name, kind = ("right", images) if self.rights else ("points", "entries")
             bad_value(name, f"a list of {count} {kind}, one per left image", f"{len(self.inputs)}")
         if self._left_size not in (None, size[::-1]):
             width, height = self._left_size
@@ -329,8 +330,12 @@ class GeometryGuidance:
         make = make_evidence if self.evidence_store is None else self.evidence_store.get
         evidence = []
         for i, (left_01, given) in enumerate(zip(lefts_01, self.inputs, strict=True)):
-            rights = zip(given.views, given.rigs, strict=True)
-            checked = any(image_size(v.image_01) == size and (r.K_right == r.K_left).all() for v, r in rights)
+            rights = [
+                (image_size(v.image_01) == size, r) for v, r in zip(given.views, given.rigs, strict=True)
+            ]
+            if any(not same and r.K_right is r.K_left for same, r in rights) and not self._cropped:
+                bad_value("K", "a tuple (K_left, K_right), as the images differ in size", "one matrix")
+            checked = any(same and (r.K_right == r.K_left).all() for same, r in rights)
             if not (self._cropped or checked):  # by the constructor, with the right image
                 check_size_of(given.K_left, size, "K" if count == 1 else f"K[{i}]", "the left image")
             with WithinCores():  # ``prepare`` may be called outside of a guided call

@@ -139,7 +139,7 @@ def _intrinsics(K: Any, name: str, views: int) -> tuple[np.ndarray, list[np.ndar
         return matrix, [matrix] * views
     if len(K) != 1 + views:
         expected = f"a 3x3 matrix or a tuple (K_left, K_right{', ...' if views > 1 else ''}), left one first"
-        bad_value(name, expected, f"a tuple of {len(K)} for {views} right views")
+        bad_value(name, expected, f"a tuple of {len(K)}, with right views: {views}")
     rights = [check_intrinsics(matrix, f"{name}[{_view(v, views)}]") for v, matrix in enumerate(K[1:])]
     return check_intrinsics(K[0], f"{name}[left]"), rights
 
@@ -153,7 +153,8 @@ def _poses(E: Any, name: str, views: int, unit: str | None) -> list[np.ndarray]:
     if isinstance(E, tuple):
         if len(E) != 1 + views:
             expected = "a tuple (E_left, E_right, ...) of camera-to-world poses, left one first"
-            bad_value(name, expected, f"a tuple of {len(E)} for {views} right views")
+            cure = "Put np.eye(4) first, or give several right views as a tuple: right=(right_1, right_2)."
+            bad_value(name, expected, f"a tuple of {len(E)}, with right views: {views}", cure)
         to_left = np.linalg.inv(check_pose(E[0], f"{name}[left]"))
         poses = [to_left @ check_pose(pose, f"{name}[{_view(v, views)}]") for v, pose in enumerate(E[1:])]
     elif views > 1:

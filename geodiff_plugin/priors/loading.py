@@ -30,13 +30,9 @@ REFUSED = {
     r"apdepth": "its U-Net takes the depth of a Depth Anything V2 Giant, whose weights were never released",
     r"lotus-?2": "it is a LoRA on FLUX.1-dev, which is gated and needs some 40 GB; Lotus v1 and v2 work",
     r"marigold.*-hr\b.*": "no code that runs it was published; marigold-depth-v1-1 takes any resolution",
-    r"geowizard-e2e-ft": "it needs GeoWizard's networks with another start; take marigold-e2e-ft-depth, "
-    "whose authors report it as better",
-    r"diffusion-?depth": "its 2023 toolchain (torch 1.10, mmdet3d, compiled extensions) cannot be installed "
-    "any more, and its metric depth is of KITTI or NYU alone",
+    r"geowizard-e2e-ft": "it needs GeoWizard's networks with another start; take marigold-e2e-ft-depth",
+    r"diffusion-?depth|ddp": "its toolchain of 2023 (torch 1.10, mmseg) cannot be installed any more",
     r"(lotus|.*e2e-ft)-normals?.*": "it predicts normals; take its sibling for depth",
-    r"ddp": "its 2023 toolchain (mmsegmentation, mmcv) cannot be installed any more, and its metric depth is "
-    "of KITTI or NYU alone",
 }
 SMALL_FILES = ["*.json", "*.txt", "*.md"]
 WEIGHTS = ["*/*.safetensors", "model*.safetensors"]

@@ -74,8 +74,9 @@ class GuidedCall(_Stock):
                 guided call. ``callback_on_step_end`` may call the pipeline, guided or not: it is restored
                 while the callback runs. A call in another thread waits.
         """
-        if guidance is None and callback_on_step_end is not None:
-            bad_value("callback_on_step_end", "given together with guidance", "guidance=None")
+        for name, given in (("callback_on_step_end", callback_on_step_end), ("strict", strict or None)):
+            if guidance is None and given is not None:
+                bad_value(name, "given together with guidance", "guidance=None")
         with Exclusive(self, guidance is not None) as held:
             if self._guided_run is not None:
                 raise RuntimeError(
@@ -90,8 +91,12 @@ class GuidedCall(_Stock):
                 run, stock = self._call_guided(call, guidance, callback_on_step_end, held)
                 with torch.autocast(self._execution_device.type, enabled=False):
                     output = assemble_output(stock, run, guidance, call, guidance.warned | warned)
-        if strict and not output.verdict.trusted:
-            refuse(output.verdict.sentence)
+        sentences = tuple(verdict.sentence for verdict in output.verdicts if not verdict.trusted)
+        untrusted = [warning for warning in output.warnings if sentences and warning.endswith(sentences)]
+        if strict and untrusted:
+            refuse(" ".join(untrusted))
+        if output.verdict.status == "not trusted":
+            warn(" ".join(untrusted), stacklevel=4)
         output.latent = stock.latent if call["output_latent"] else None
         return output if call["return_dict"] else (output.prediction, output.uncertainty, output.latent)
 

@@ -22,15 +22,8 @@ from geodiff_plugin.geometry import image_size
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.matching import Matches, with_points
 from geodiff_plugin.priors import DepthPrior
+from geodiff_plugin.runtime import hooks
 from geodiff_plugin.runtime.estimate import MapCodec, ProcessingGrid, StepEstimate, StepInputs
-from geodiff_plugin.runtime.hooks import (
-    DenoiserTap,
-    Exclusive,
-    GuidedScheduler,
-    frozen_weights,
-    images_in_float32,
-    replaced,
-)
 from geodiff_plugin.runtime.noise_levels import noise_level
 
 StepCallback = Callable[[Any, int, Any, dict[str, Tensor | None]], dict[str, Tensor] | None]
@@ -75,7 +68,7 @@ class GuidedRun:
         rounds: int,
         callback: StepCallback | None = None,
         tiny: Any | None = None,
-        held: Exclusive | None = None,
+        held: hooks.Exclusive | None = None,
     ) -> None:
         self.pipe, self.prior, self.config, self.evidence = pipe, prior, guidance.config, evidence
         self.owners = [i for i in range(len(evidence)) for _ in range(call["ensemble_size"])]
@@ -96,18 +89,18 @@ class GuidedRun:
         self._stack, self._bar = ExitStack(), None
         self._tap = None
         if guidance.through_network and prior.network_input is not None:
-            self._tap = DenoiserTap(*prior.network(), prior.network_input)
-        self._scheduler = GuidedScheduler(pipe, self, self.config.respace)
+            self._tap = hooks.DenoiserTap(*prior.network(), prior.network_input)
+        self._scheduler = hooks.GuidedScheduler(pipe, self, self.config.respace)
 
     def __enter__(self) -> GuidedRun:
         with ExitStack() as stack:
-            stack.enter_context(frozen_weights(self.pipe))
-            stack.enter_context(images_in_float32(self.pipe.image_processor))
+            stack.enter_context(hooks.frozen_weights(self.pipe))
+            stack.enter_context(hooks.images_in_float32(self.pipe.image_processor))
             if self._tap is not None:
                 stack.enter_context(self._tap.attached())
             stack.enter_context(self._scheduler.attached())
             # Tells the pipeline's decoding and ensembling that they are guided.
-            stack.enter_context(replaced(self.pipe, "_guided_run", self))
+            stack.enter_context(hooks.replaced(self.pipe, "_guided_run", self))
             self._stack = stack.pop_all()
         return self
 

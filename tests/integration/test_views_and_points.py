@@ -64,7 +64,7 @@ def test_points_instead_of_a_second_view_as_a_map_or_as_the_cloud_that_projects_
     cloud = np.concatenate([rays * sparse[rows, columns, None], [[0.0, 0.0, -1.0]]])
     as_cloud = run(GeometryGuidance.from_points(cloud, K, **FAST))
     np.testing.assert_allclose(as_cloud.prediction, out.prediction, rtol=1e-3)
-    assert as_cloud.warnings == ["1 points lie behind the left camera or outside its image: left out."]
+    assert as_cloud.warnings == ["1 points outside the left image are left out: is their frame right?"]
 
 
 def test_points_of_another_size_than_the_image(run, group):

@@ -218,7 +218,8 @@ def test_eval_capture_measures_every_row(tmp_path, monkeypatch):
     monkeypatch.setattr(PriorCache, "fingerprint", lambda self, settings: "prior")
     factor = {"solved": 1.02, "given": 1.1}
     monkeypatch.setattr(Capture, "depth", depth_by(lambda capture: factor[capture.solve().status]))
-    rows, out = ("given", "capture"), tmp_path / "out"
+    capture, rows, out = Capture.open(data), ("given", "capture"), tmp_path / "out"
+    assert [capture.solve(way).status for way in ("given", None, "refined")] == ["given", "given", "solved"]
     options = CaptureEvalOptions(data=(data,), count=4, neighbours=(2,), rows=rows, out=out, quiet=True)
     (table,) = COMMANDS["capture"]("capture", options).tables
     assert table.title == "scan, 4 frames" and [row[1] for row in table.rows] == ["3", "3", "all"]

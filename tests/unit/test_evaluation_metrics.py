@@ -38,7 +38,8 @@ def test_depth_metrics_pixel_by_pixel(seed, cap):
     expected["silog"] = 100 * math.sqrt(max(squares - (sum(logs) / n) ** 2, 0.0))
     for k in (1, 2, 3):
         expected[f"delta{k}"] = sum(max(p / t, t / p) < 1.25**k for p, t in pairs) / n
-    assert metrics.evaluate_depth(pred, truth, valid, cap) == pytest.approx(expected, abs=1e-4)
+    for mask in (valid, valid.astype(np.uint8)):
+        assert metrics.evaluate_depth(pred, truth, mask, cap) == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.parametrize("step_px", [0.0, 1.5, 4.0])

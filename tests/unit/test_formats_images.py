@@ -170,7 +170,7 @@ def with_value(value):
     ("value", "error", "match"),
     [
         (with_value(-0.9), ValueError, r"-0\.9.*\(x \+ 1\) / 2"),
-        (np.zeros((1, H, W, 3)), ValueError, r"batch: value\[0\]"),
+        (np.zeros((1, H, W, 3)), ValueError, r"A batch is a list: list\(value\)"),
         (torch.zeros(H, W), ValueError, r"value\[None\]"),
         (torch.zeros(H, W, 3), ValueError, r"permute\(2, 0, 1\)"),
         (np.zeros((H, W, 2)), ValueError, "1, 3 or 4 channels"),

@@ -75,6 +75,8 @@ def test_views_in_any_world_frame():
         guidance.prepare(torch.zeros(1, 3, 24, 32))
     with pytest.raises(ValueError, match="right must be a list of 2 images"):
         guidance.prepare(torch.rand(2, 3, *SIZE))
+    with pytest.raises(ValueError, match="as the images differ in size; got one matrix"):
+        GeometryGuidance(RIGHT, K, E).prepare(torch.zeros(1, 3, 24, 32))
 
 
 def test_points_of_either_form():
@@ -102,7 +104,11 @@ def test_points_of_either_form():
         ({"right": None, "points": POINTS}, ValueError, "E must be None without a right view"),
         ({"right": [RIGHT, RIGHT], "E": [E]}, ValueError, "E must be a list of 2 entries"),
         ({"right": (RIGHT, RIGHT)}, TypeError, "E must be a tuple"),
-        ({"right": (RIGHT, RIGHT), "E": (I4, E)}, ValueError, "a tuple of 2 for 2 right views"),
+        (
+            {"right": (RIGHT, RIGHT), "E": (I4, E)},
+            ValueError,
+            "right views: 2. Put np.eye",
+        ),
         ({"right": [RIGHT, None], "E": [E, None], "points": [POINTS] * 2}, ValueError, "right must be given"),
         ({"left_size": "64x48"}, TypeError, "left_size must be"),
         ({"unit": "mm"}, ValueError, "unit must be 'm' or None"),

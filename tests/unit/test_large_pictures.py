@@ -29,7 +29,8 @@ def written(folder, scene):
     valid = ~flying_points(depth_m)
     zeros = write_depth_mm(folder / "mm.png", depth_m)
     count = write_ply(folder / "cloud.ply", depth_m, image, K, valid=valid)
-    cloud = make_cloud(depth_m, image, K, valid)
+    cloud, levels = make_cloud(depth_m, image, K, valid), np.rint(255 * image).astype(np.uint8)
+    assert (make_cloud(depth_m, levels, K, valid).colours == cloud.colours).all()
     counts = np.array([zeros, count, len(cloud.points_m)])
     pictures = colour_depth(depth_m), np.asarray(share_figure(depth_m, "share", 5.0))
     return valid, counts, np.asarray(Image.open(folder / "mm.png")), cloud.points_m, cloud.colours, *pictures

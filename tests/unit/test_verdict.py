@@ -15,6 +15,7 @@ from geodiff_plugin.runtime.verdict import Indicators, judge
 from tests.scenes import render_pair
 
 GOOD = Indicators(confidence=0.85, matched=0.8, order=0.8, spread=0.7, baseline_m=0.12, view_deg=60.0)
+ROW = {"points": 448, "cover": 0.125}
 ONE_POINT = {"points": 1, "matched": math.nan, "confidence": math.nan}
 
 
@@ -32,7 +33,8 @@ def test_a_good_run_is_trusted_in_silence():
         {"order": 0.1, "matched": 0.95},  # a poor prior under good matches
     ):
         assert judge(replace(GOOD, **signs)).trusted and not judge(replace(GOOD, **signs)).remarks
-    assert judge(Indicators(points=9)).trusted
+    assert judge(Indicators(points=99, cover=0.5)).trusted
+    assert all(judge(Indicators(**few)).status == "not judged" for few in ({"points": 49, "cover": 1}, ROW))
 
 
 @pytest.mark.parametrize(
@@ -54,8 +56,12 @@ def test_a_good_run_is_trusted_in_silence():
         ({"points_ratio": 3.0, "points": 99}, "3 times as far"),
         ({"epipolar_px": 9.5}, "9.5 px beside"),
         ({"epipolar_px": 1.5, "confidence": 0.45}, "Likely causes"),
-        (ONE_POINT, "Too few known depths to fix both scale and shift, 1;"),
-        ({"view_deg": 179.0}, "179 degrees of view"),
+        (ONE_POINT, "1 known depths cannot fix both scale and shift"),
+        (
+            {"points": 99, "cover": 1.0, "matched": math.nan, "order": 0.1},
+            "known depths disagree",
+        ),
+        ({"at_end": 0.26}, "26 % of the matches lie at an end"),
         ({"baseline_m": 0.00012}, "0.12 mm"),
         ({"order": -0.9, "doubts": ("K is for another image.",)}, "depth: K is for another image"),
         ({"off_matches": 0.4}, "differs by 49 %"),
@@ -126,6 +132,8 @@ def test_a_rendered_pair_right_and_wrong(run, scene):
         assert not out.verdicts[0].trusted and words in " ".join(out.warnings)
     black = np.zeros_like(left)
     assert not run(left=black, right=black).verdicts[0].indicators.same
+    with pytest.warns(UserWarning, match="Do not trust this depth"):
+        run(right=left.copy())
     with pytest.raises(InputError, match="Do not trust this depth"):
         run(right=np.ascontiguousarray(right[:, ::-1]), strict=True)
 
