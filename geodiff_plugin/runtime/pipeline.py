@@ -96,7 +96,7 @@ class GuidedCall(_Stock):
         if strict and untrusted:
             refuse(" ".join(untrusted))
         if output.verdict.status == "not trusted":
-            warn(" ".join(untrusted), stacklevel=4)
+            warn(" ".join(untrusted), stacklevel=3)
         output.latent = stock.latent if call["output_latent"] else None
         return output if call["return_dict"] else (output.prediction, output.uncertainty, output.latent)
 
