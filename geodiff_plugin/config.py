@@ -158,9 +158,9 @@ class GuidanceConfig:
         positive: how raw scale and shift become positive (Eq. 13); `square` also clips the map to [0, 1].
         g_s_range: candidates of the one-number search.
         g_s_candidates: the number of these candidates.
-        reject_reflections: regions of matches behind the prior's first estimate count as reflections.
+        reject_reflections: regions of matches behind the first decoded estimate count as reflections.
         correct: the decoded map is fitted to its matches and points and the change is encoded, before the
-            updates; with `gradient="denoised"` only (after SteeredMarigold, Gregorek and Nalpantidis 2024).
+            updates, unless these go through the network (SteeredMarigold, Gregorek and Nalpantidis 2024).
         corrections: upper bound on the number of steps (or rounds of a one-step prior) that are corrected:
             the last, and the others spread over the second half of the schedule where they fit.
         even_ensemble: median of an even number of members: mean of the middle two, or the lower of them.
@@ -171,7 +171,7 @@ class GuidanceConfig:
         match_noise: relative error of a perfect match.
         outlier_width: standard deviations from its region beyond which a match counts for less.
         rule: how a gradient moves the latent, scale and shift: `plain`; `summed`, plain, but the latent
-            follows the sum of the loss over its pixels; `adam`; `adam-norm`, Adam on the gradient scaled to
+            follows the loss times its pixels; `adam`; `adam-norm`, Adam on the gradient scaled to
             the noise's norm (Marigold-DC).
         step_latents: step size of `rule` on the latent.
         step_affine: step size of `rule` on raw s_hat, t_hat.

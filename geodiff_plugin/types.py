@@ -63,7 +63,7 @@ class PoseReport:
     ``status`` is ``"given"`` (not checked, by configuration), ``"fits"``, ``"refined"``, ``"kept"`` (no
     better pose nearby), ``"mistaken"`` (a usual mistake explains the misfit; the pose is used as given) or
     ``"not checked"``. Residuals are in pixels of the right images, resized to the left image's pixels per
-    radian; the left image is at most 832 wide.
+    radian; the left image is at most 832 on its longer side.
     """
 
     status: str

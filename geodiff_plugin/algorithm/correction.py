@@ -58,15 +58,15 @@ SHARE, NORMAL_QUANTILE = 0.8, 1.2816
 class _Observations(NamedTuple):
     """Matches against a map on their grid, ``(B, 1, h, w)`` each, and the links of that grid.
 
-    ``residual`` is the log of a match's inverse depth over the map's, ``noise`` its
-    standard deviation, ``weight`` confidence over relative variance, ``right_share (B, 1)`` the share of the
-    weight that correct matches are expected to have, ``links`` are across and down, at a smoothness of 1.
+    ``residual`` is the log of a match's inverse depth over the map's, ``noise`` its standard deviation,
+    ``weight`` confidence over relative variance, ``correct_share (B, 1)`` the share of the weight that
+    correct matches are expected to have, ``links`` are across and down, at a smoothness of 1.
     """
 
     residual: Tensor
     noise: Tensor
     weight: Tensor
-    right_share: Tensor
+    correct_share: Tensor
     links: tuple[Tensor, Tensor]
 
 
@@ -79,9 +79,9 @@ def _observations(depth_m: Tensor, target: Matches, left_01: Tensor, config: Gui
     weight = target.confidence * (config.match_noise / noise) ** 2
     residual = torch.where(weight > 0, matched.log() + log_depth, torch.zeros_like(matched))
     right = (weight * target.confidence.clamp_max(1.0)).flatten(1).sum(1, keepdim=True)
-    right_share = right / weight.flatten(1).sum(1, keepdim=True).clamp_min(1e-9)
+    correct_share = right / weight.flatten(1).sum(1, keepdim=True).clamp_min(1e-9)
     across, down = (_links(guide, log_depth, axis) for axis in (-1, -2))
-    return _Observations(residual, noise, weight, right_share, (across, down))
+    return _Observations(residual, noise, weight, correct_share, (across, down))
 
 
 def _log_depth(depth_m: Tensor, size: tuple[int, int]) -> Tensor:
@@ -197,7 +197,7 @@ def _spread(residual: Tensor, observed: _Observations) -> Tensor:
     The largest residuals are left out, as many as matches are expected to be wrong. No match: ``MOST_ERROR``.
     """
     weight = observed.weight.flatten(1)
-    largest = weighted_quantile(residual.abs().flatten(1), weight, SHARE * observed.right_share)
+    largest = weighted_quantile(residual.abs().flatten(1), weight, SHARE * observed.correct_share)
     noise = weighted_quantile(observed.noise.flatten(1), weight, 0.5)
     beyond = ((largest / NORMAL_QUANTILE) ** 2 - noise**2 / 4.0).clamp_min(0.0).sqrt()
     beyond = torch.where(weight.sum(1) > 0, beyond, MOST_ERROR)
@@ -212,7 +212,7 @@ def prior_error(
 
     Cross-validation: matches are left out in blocks and predicted from the other blocks by the prior's map
     under a stiff correction. This measures the map between matches, not how well it can be bent to them.
-    Arguments as ``refine_depth``, for a map that matches have moved in scale and shift only.
+    Arguments as ``fit_depth``, for a map that matches have moved in scale and shift only.
     """
     observed = _observations(depth_m, target, left_01, config)
     height, width = observed.residual.shape[-2:]
@@ -227,7 +227,7 @@ def prior_error(
 
 
 @torch.no_grad()
-def refine_depth(
+def fit_depth(
     depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor, config: GuidanceConfig = DEFAULT
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Least-squares correction of log depth that follows matches and stops at edges.

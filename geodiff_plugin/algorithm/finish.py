@@ -1,7 +1,7 @@
 """The last stage: place the depth edges of the result by prior, matches and colours of the image.
 
 Beyond the paper, whose result is the decoded latent. Ramps between two surfaces are made steep, the map is
-fitted to its matches (``correction.refine_depth``), and the matches around every pixel vote on its depth.
+fitted to its matches (``correction.fit_depth``), and the matches around every pixel vote on its depth.
 Weighted medians after Ma et al., Constant Time Weighted Median Filtering for Stereo Matching and Beyond, ICCV
 2013; large pictures after Kopf et al., Joint Bilateral Upsampling, SIGGRAPH 2007.
 """
@@ -160,10 +160,10 @@ def vote_depth(
 
     The weighted median of the votes chooses a surface; the mean of those near it is the depth. Rows of a
     rectified view are matched again at this resolution, for edges that the sweep's grid cannot resolve;
-    without a rectified view the map is returned unchanged. ``depth_m (1, 1, H, W)`` is fitted to the matches;
-    left image, K and views are native; the prior's ``error (1, 1, 1, 1)``, and its ``spacing`` as in
-    ``sharpen_edges``, decide how much contradicting matches, and the map itself, count. The result stays
-    within the range of ``depth_m``.
+    without one of the left image's size the map is returned unchanged. ``depth_m (1, 1, H, W)`` is fitted to
+    the matches; left image, K and views are native; the prior's ``error (1, 1, 1, 1)``, and its ``spacing``
+    as in ``sharpen_edges``, decide how much contradicting matches, and the map itself, count. The result
+    stays within the range of ``depth_m``.
     """
     native = image_size(left_01)
     rectified = [v for v in views if is_rectified(K_left, v.K, v.T_right_from_left)]

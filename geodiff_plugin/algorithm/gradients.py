@@ -55,8 +55,8 @@ class FiniteWatch:
         bad_value(f"{name} of denoising step {step + 1}", f"finite in {short}", "NaN or infinity in it", cure)
 
 
-#: The plain rule, but the latent follows the sum of the loss over pixels, since Eq. 14 is a norm. Along the
-#: mean the printed step of 1e-2 moves a latent by less than a thousandth.
+#: The plain rule, but the latent follows the loss, a mean over visible pixels, times the number of pixels, by
+#: which the caller multiplies the rate. Along the mean the printed step of 1e-2 changes nothing.
 SUMMED = "summed"
 
 

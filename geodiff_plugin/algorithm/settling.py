@@ -63,8 +63,8 @@ def settle_ends(
     """Metres ``(B,)`` of both ends of maps ``x (B, 1, h, w)``, and whether they are on the edge of the range.
 
     ``evidence`` has an entry per sample, as has ``owners``, the image of each; samples of one image lie side
-    by side. ``current`` ends stay unless a better basin shows up; ``on_edge`` is the result before, ``None``
-    at first; ``valid`` marks the pixels where the prior gives a depth.
+    by side. ``current`` ends stay unless a better basin shows up; ``on_edge`` is the previous result or
+    ``None``; ``valid`` marks the pixels where the prior gives a depth.
     """
     results = []
     for image in sorted(set(owners)):

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.correction import correction_target, local_error, prior_error, refine_depth
+from geodiff_plugin.algorithm.correction import correction_target, fit_depth, local_error, prior_error
 from geodiff_plugin.algorithm.evidence import Evidence, chunk_views, within
 from geodiff_plugin.algorithm.gradients import RULES, SUMMED, FiniteWatch
 from geodiff_plugin.algorithm.settling import search_one_number, settle_ends, span_of_points
@@ -144,7 +144,7 @@ class Trajectory:
         target, error = self._target(depth_m), local_error(self.error, self.valid)
         if target is None or error is None:
             return x
-        _, _, field = refine_depth(depth_m, target, self.objective.views.left_01, error, self.config)
+        _, _, field = fit_depth(depth_m, target, self.objective.views.left_01, error, self.config)
         # Resample the factor, not the difference of maps, which would be wrong on both sides of an edge.
         field = F.interpolate(field, x.shape[-2:], mode="bilinear", antialias=True)
         return self.metric.relative(self.metric(x, self.affine) * torch.exp(-field), self.affine)

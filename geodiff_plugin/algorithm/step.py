@@ -62,7 +62,7 @@ def gradient_step(
             state.find_hidden(x0.detach())
         s_hat, t_hat = (v.detach().requires_grad_() for v in (state.affine.s_hat, state.affine.t_hat))
         affine = replace(state.affine, s_hat=s_hat, t_hat=t_hat)
-        L_geo = state.loss(x0, affine, z0, anchor)  # Eq. 14 of Eq. 16's metric depth, with Eq. 17
+        L_geo = state.loss(x0, affine, z0, anchor)  # Eq. 14 of Eq. 16, with Eq. 17 and any further terms
         inputs = (s_hat, t_hat, x0, z0) if moves else (s_hat, t_hat)
         total = L_geo.total.sum()  # samples are independent, so the sum has each sample's gradient
         grad_s, grad_t, *grads = torch.autograd.grad(total, inputs, allow_unused=True, materialize_grads=True)

@@ -257,7 +257,7 @@ class Objective:
         self.views, self.metric, self.config = views, metric, config
 
     def metric_depth(self, x: Tensor, affine: AffineState) -> Tensor:
-        """``x (B, 1, h, w)`` upsampled to the loss grid, then Eq. 16: ``(B, 1, H, W)`` metres."""
+        """``x (B, 1, h, w)`` resized to the loss grid, then Eq. 16: ``(B, 1, H, W)`` metres."""
         x = self.metric.confine(x)
         if x.shape[-2:] != self.views.size:
             x = F.interpolate(x, self.views.size, mode="bilinear", align_corners=False)

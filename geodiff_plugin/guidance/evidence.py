@@ -37,7 +37,7 @@ def make_evidence(
 ) -> Evidence:
     """Clean the photographs, refine the poses, and prepare the ``Evidence`` of one native left image.
 
-    ``needs_matches``: match the volume against each view. ``measured``: the lengths of the baselines are.
+    ``needs_matches``: match the volume against each view. ``measured``: baseline lengths are measured.
     """
     views, K_left, points = given.on(left_01.device)
     if not views:

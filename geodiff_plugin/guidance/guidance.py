@@ -344,7 +344,7 @@ class GeometryGuidance:
 
 
 def assume_same_centre(guidance: GeometryGuidance) -> None:
-    """Note that the right camera's K was not given, where the pair is rectified: there it matters most."""
+    """Note that the right camera's K was not given, where the cameras are parallel: there it matters most."""
     if any(np.trace(rig.E[:3, :3]) > 1.0 + 2.0 * PARALLEL for rig in guidance.rigs):
         guidance.assumed = [SAME_CENTRE]
 

@@ -38,7 +38,8 @@ LARGEST = 1.5
 class Matches:
     """Matches between the views, or known points, on one grid of the left view; of one image or of a chunk.
 
-    ``inverse_depth`` and ``confidence`` in [0, 1] are ``(1, H, W)`` of one image, or ``(B, 1, H, W)``.
+    ``inverse_depth`` and ``confidence`` are ``(1, H, W)`` of one image, or ``(B, 1, H, W)``. Confidence lies
+    in [0, 1], but above 1 at the known points of ``with_points``.
     """
 
     inverse_depth: Tensor  # float32, 1/m; defined everywhere, to be read where ``confidence > 0``
@@ -66,7 +67,7 @@ class Matches:
         return replace(self, confidence=self.confidence * inside.view_as(self.confidence))
 
     def above(self, confidence: float) -> Tensor:
-        """Flat indices ``(P,)`` of one image's pixels above a confidence, cached: a GPU is waited for."""
+        """Flat indices ``(P,)`` of one image's pixels above a confidence; cached, to wait for a GPU once."""
         if confidence not in self._above:
             self._above[confidence] = (self.confidence.flatten() > confidence).nonzero()[:, 0]
         return self._above[confidence]

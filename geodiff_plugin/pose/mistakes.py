@@ -132,7 +132,7 @@ def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:
     """A sentence where baseline and scene are both a hundred or a thousand times too large, or ``None``.
 
     Only the resulting depths show the unit of a translation. ``check_baseline`` has warned of baselines above
-    ``LONG_BASELINE_M``. Nearer scenes pass: 100 m above ground drones take such steps.
+    ``LONG_BASELINE_M``. Nearer scenes pass: a drone 100 m up has such baselines.
     """
     baseline = float(np.linalg.norm(T[:3, 3]))
     inverse_depth = solve_inverse_depth(tracks, T[None])

@@ -31,8 +31,8 @@ from geodiff_plugin.pose.tracks import (
 )
 from geodiff_plugin.types import CameraView, PoseReport
 
-#: A pose fits if its matches lie nearer than this to their epipolar lines, in the median: that of a rectified
-#: rig, whose lenses cause errors as large, and any other, where a shift may hide most of a wrong rotation.
+#: Largest median distance of matches from their epipolar lines at which a pose fits: for rectified rigs,
+#: whose lenses alone err this much; for others, where a shift hides most of a wrong rotation.
 FITS_PX, POSED_FITS_PX = 0.45, 0.3
 #: The user is warned if the given pose has a larger residual than this.
 WARNS_PX = 1.0
@@ -276,7 +276,7 @@ def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[str, ..
 
 
 def _misfit(before: np.ndarray, v: int, rest: str) -> tuple[str, ...]:
-    """A sentence on the misfit of view ``v`` that ends with ``rest``; none if no misfit is large."""
+    """A sentence on the misfit of view ``v``, with ``rest`` and likely causes; none if no misfit is large."""
     if not np.nanmax(before) > WARNS_PX:
         return ()
     pose = "The pose as given" if len(before) == 1 else f"The pose of right view {v + 1} as given"

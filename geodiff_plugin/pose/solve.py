@@ -33,10 +33,10 @@ FREE_PX = 1e3
 #: The user is warned if an estimated pose leaves depth a larger relative standard deviation than this.
 MOST_SPREAD = 0.06
 _STEPS = 12
-# A refined pose may move the points, also along their lines, by a share of the residual that it explains:
-# (explained residual / (first number * faults))^4, within bounds. Faults are errors of the cameras (rolling
-# shutter, lenses, K), which the residuals of neighbours have in common. Below, a free pose would hide the
-# faults; above, the given pose was wrong.
+# A refined pose may move points, also along their lines, by this share of the residual that it explains:
+# (explained residual / (_FAULTS * faults))^4, within the bounds _MOVED_SHARE. Faults are errors of the
+# cameras (rolling shutter, lenses, K), which the residuals of neighbours have in common. Below, a free pose
+# would hide the faults; above, the given pose was wrong.
 _FAULTS, _MOVED_SHARE = 5.6, (0.2, 40.0)
 _FLOOR_PX, _LEAST_FAULT_PX = 0.05, 0.03
 # A rectified pair has another share and a narrower prior: its cameras are bolted together, turn by tenths

@@ -39,11 +39,10 @@ def depth_evidence(
 ) -> Tensor:
     """Features ``(B, 5, H, W)`` of the logistic model in ``depth_confidence``, whose arguments these are.
 
-    They are 1, certainty, strength, agreement and spread. With less support, a pixel's prior error moves from
-    the measured one towards a useless prior's. Certainty is the log of .05 over the
-    remaining error, ``(1 - support) * error``; strength is the log of .15 over ``error``, because wrong
-    matches lose their weight with a good prior, while a poor one follows them. Agreement is the log of .1
-    over the photometric error.
+    They are 1, certainty, strength, agreement and spread. With less support, a pixel's prior error e moves
+    from the measured one towards a useless prior's. Certainty is the log of .05 over the remaining error,
+    ``(1 - support) * e``; strength is the log of .15 over e, because wrong matches lose their weight with a
+    good prior, while a poor one follows them. Agreement is the log of .1 over the photometric ``error``.
     """
     agreement = -(error.clamp(_LEAST_DIFFERENCE, _MOST_DIFFERENCE) / _MOST_DIFFERENCE).log()
     measured = support.new_tensor(_USELESS) if prior_error is None else prior_error.clamp(_BEST, _USELESS)
@@ -65,7 +64,7 @@ def depth_confidence(
 ) -> Tensor:
     """Probability ``(B, 1, H, W)`` that a depth is within 10 % of the truth.
 
-    From the support of ``refine_depth``, the photometric error, the relative spread of an ensemble's members
+    From the support of ``fit_depth``, the photometric error, the relative spread of an ensemble's members
     (or ``None``), and the prior's ``local_error`` on any grid (``None`` counts as a useless prior).
     """
     weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)

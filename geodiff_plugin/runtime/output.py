@@ -15,7 +15,7 @@ from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImage
 from torch import Tensor
 
 from geodiff_plugin._checks import InputError, check_choice
-from geodiff_plugin.algorithm.correction import correction_target, refine_depth
+from geodiff_plugin.algorithm.correction import correction_target, fit_depth
 from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth
 from geodiff_plugin.geometry import image_size, resize_intrinsics
 from geodiff_plugin.guidance.guidance import GeometryGuidance
@@ -51,7 +51,7 @@ def _finish(
     if target is None or error is None:
         return None
     native = evidence.native_left[None]
-    fitted_m, support, _ = refine_depth(depth_m, target, native, error, run.config)
+    fitted_m, support, _ = fit_depth(depth_m, target, native, error, run.config)
     if matches is not None:
         target = correction_target(matches, points, kept, error, fitted_m)
         assert target is not None  # there are matches

@@ -12,7 +12,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from geodiff_plugin._checks import bad_type, bad_value
-from geodiff_plugin.algorithm.correction import local_error, prior_error, refine_depth
+from geodiff_plugin.algorithm.correction import fit_depth, local_error, prior_error
 from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.schedule import Schedule, make_schedule
 from geodiff_plugin.algorithm.state import Trajectory
@@ -46,7 +46,7 @@ def depth_prompt(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor
         median = 1.0 / target.inverse_depth[target.confidence > 0].median()
         flat, left = median.expand(1, 1, height, width), image.left_01[None]
         error = prior_error(flat, target, left, config=config)
-        depth_m, _, _ = refine_depth(flat, target, left, error, config=config)
+        depth_m, _, _ = fit_depth(flat, target, left, error, config=config)
         maps.append(F.interpolate(depth_m, size, mode="bilinear", antialias=True))
     return torch.cat(maps)
 

@@ -286,8 +286,8 @@ def _why_matches(run: Indicators) -> str:
 
 def _lines(run: Indicators) -> str:
     return (
-        f"Matches lie {run.epipolar_px:.1f} px beside their epipolar lines, and no pose near the given one "
-        "brings them closer: are the images rectified or the poses right, and is K for them?"
+        f"Matches lie {run.epipolar_px:.1f} px off their epipolar lines, and no pose near the given one "
+        "brings them closer: are the images rectified, the poses right, and K for these images?"
     )
 
 

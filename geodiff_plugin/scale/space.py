@@ -74,7 +74,7 @@ class Space:
     from_ends: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
     def ends(self, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-        """The depths at ``x = 0`` and ``x = 1`` from the nearest and the farthest depth, and the inverse."""
+        """The depths at ``x = 0`` and ``x = 1`` from ``(near, far)``, and the reverse: swapped if x falls."""
         return (near, far) if self.grows_with_depth else (far, near)
 
     def range_of(self, scale: Tensor, shift: Tensor, g_s: Tensor) -> tuple[Tensor, Tensor]:

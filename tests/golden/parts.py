@@ -15,10 +15,10 @@ from PIL import Image
 
 from geodiff_plugin.algorithm.correction import (
     correction_target,
+    fit_depth,
     local_error,
     off_edges,
     prior_error,
-    refine_depth,
 )
 from geodiff_plugin.algorithm.evidence import chunk_views, prepare_evidence
 from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth
@@ -290,7 +290,7 @@ def correction() -> dict[str, object]:
     for name, of_prior in (("good", 0.02), ("fair", 0.06), ("poor", 0.2), ("local", None)):
         e = torch.full((1, 1, 1, 1), of_prior or 0.05)
         e = local_error(e, valid if of_prior is None else None)
-        refined_m, support, field = refine_depth(depth_m, target, left, e)
+        refined_m, support, field = fit_depth(depth_m, target, left, e)
         result |= {
             f"{name}_change": (refined_m / depth_m).log(),
             f"{name}_support": support,
@@ -301,7 +301,7 @@ def correction() -> dict[str, object]:
     kept = torch.linspace(0, 1, 30 * 44).view(1, 1, 30, 44)
     both = correction_target(target, points, kept, e, depth_m)
     assert both is not None
-    refined_m, _, _ = refine_depth(depth_m, both, left, torch.full((1, 1, 1, 1), 0.05))
+    refined_m, _, _ = fit_depth(depth_m, both, left, torch.full((1, 1, 1, 1), 0.05))
     return result | {"with_points": refined_m / depth_m, "target": both.confidence.clamp_max(1.0)}
 
 

@@ -142,7 +142,7 @@ class Fit:
         self.noise = np.hypot(self.step / self.inverse, DEFAULT.match_noise)
         self.weight = self.confidence * (DEFAULT.match_noise / self.noise) ** 2
         self.residual = np.where(self.weight > 0, np.log(self.inverse * self.depth), 0)
-        self.right_share = (self.weight * self.confidence).sum() / self.weight.sum()
+        self.correct_share = (self.weight * self.confidence).sum() / self.weight.sum()
         scale = self.width / 512
         self.edges = []  # the two ends of every link, and its strength
         index = np.arange(rows.size).reshape(rows.shape)
@@ -183,7 +183,7 @@ class Fit:
 
     def spread(self, residual):
         """Standard deviation of residuals beyond the noise, by the 80 % quantile of right matches."""
-        largest = self.quantile(np.abs(residual), 0.8 * self.right_share)
+        largest = self.quantile(np.abs(residual), 0.8 * self.correct_share)
         return np.sqrt(max((largest / 1.2816) ** 2 - self.quantile(self.noise, 0.5) ** 2 / 4, 0))
 
     def quantile(self, values, share):
@@ -228,7 +228,7 @@ def test_a_correction_is_three_passes_of_weighted_least_squares(fit, error):
         part, weight = fit.solve(fit.residual - total, weight, smoothness, inertia, robust, 2)
         total += part
     depth, target, left = fit.torch()
-    refined, _, field = correction.refine_depth(depth, target, left, torch.full((1, 1, 1, 1), error))
+    refined, _, field = correction.fit_depth(depth, target, left, torch.full((1, 1, 1, 1), error))
     np.testing.assert_allclose(field[0, 0], total, atol=5e-4)
     np.testing.assert_allclose(refined[0, 0], fit.depth * np.exp(-total), rtol=1e-3)
 

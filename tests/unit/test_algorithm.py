@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.algorithm import finish
-from geodiff_plugin.algorithm.correction import correction_target, off_edges, refine_depth
+from geodiff_plugin.algorithm.correction import correction_target, fit_depth, off_edges
 from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth
 from geodiff_plugin.algorithm.gradients import RULES, Adam, FiniteWatch, pull_back
 from geodiff_plugin.algorithm.schedule import count_steps, make_schedule
@@ -142,7 +142,7 @@ def test_a_correction_spreads_over_its_surface_and_stops_at_an_edge():
     confidence = torch.zeros_like(truth)
     confidence[..., :, 5:10] = 1.0
     error = torch.full((1, 1, 1, 1), 0.1)
-    depth_m, support, _ = refine_depth(1.2 * truth, matches_at(truth, confidence), left, error)
+    depth_m, support, _ = fit_depth(1.2 * truth, matches_at(truth, confidence), left, error)
     own, other = depth_m[..., 10:14], depth_m[..., 31:]
     assert (own / 2.0 - 1.0).abs().max() < 0.09
     assert (other / 2.4 - 1.0).abs().max() < 0.09  # half of what the surface beside it moved by

@@ -54,7 +54,7 @@ def test_a_good_run_is_trusted_in_silence():
         ({"points_ratio": 0.256, "points": 99}, "read as millimetres: give the points' scale as 256"),
         ({"points_ratio": 1000.0, "points": 99}, "millimetres taken for metres"),
         ({"points_ratio": 3.0, "points": 99}, "3 times as far"),
-        ({"epipolar_px": 9.5}, "9.5 px beside"),
+        ({"epipolar_px": 9.5}, "9.5 px off"),
         ({"epipolar_px": 1.5, "confidence": 0.45}, "Likely causes"),
         (ONE_POINT, "1 known depths cannot fix both scale and shift"),
         (
@@ -83,7 +83,7 @@ def test_reasons(signs, words):
         ({"prior_ratio": 2.1}, "2.1 times the prior's own metres"),
         ({"points_ratio": 1.15, "points": 99}, "1.15 times as far"),
         ({"points": 1}, "Known depths that lie in the image: 1"),
-        ({"epipolar_px": 2.4}, "2.4 px beside"),
+        ({"epipolar_px": 2.4}, "2.4 px off"),
         ({"on_edge": True, "at_end": 0.2}, "ended on the edge"),
     ],
 )
