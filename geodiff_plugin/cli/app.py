@@ -146,7 +146,7 @@ COMMANDS = {
     "capture": Command(CaptureOptions, _capture, "Depth of a capture's frames, and one cloud of all."),
     "demo": Command(_Demo, _Demo.run, "Run on a rendered pair of the package, and print how good it is."),
     "info": Command(_Info, _later("cli.info.run_info"), "Versions, devices, priors and what is cached."),
-    "bench": Command(_Bench, _later("cli.demo.run_bench"), "What guidance costs in seconds and memory."),
+    "bench": Command(_Bench, _later("cli.demo.run_bench"), "What guidance costs in seconds."),
     "video": Command(_Video, _later("cli.outputs.run_video"), "Join depth maps of a sequence into a video."),
     "submit": Command(_Submit, _later("cli.outputs.run_submit"), "Write files for Middlebury and ETH3D."),
     "app": Command(_Page, _later("app.launch.run_app"), "Serve a web page to measure on (extra app)."),

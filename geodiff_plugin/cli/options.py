@@ -58,7 +58,7 @@ class DepthOptions(RunOptions):
     fy: float | None = _camera(None, "Focal length, pixels.")
     cx: float | None = _camera(None, "Principal point, pixels.")
     cy: float | None = _camera(None, "Principal point, pixels.")
-    baseline: float | None = _camera(None, "Between the cameras; replaces --calib's.", above_0="metres")
+    baseline: float | None = _camera(None, "Metres between cameras; replaces --calib's.", above_0="metres")
     cx_right: float | None = _camera(None, "cx of the right camera of a rectified pair; --cx if none.")
     k: Path | None = _camera(None, "3x3 intrinsics, text or .npy.", "--K")
     e: Path | None = _camera(None, "4x4 pose of the right camera in the left one's frame, metres.", "--E")

@@ -317,7 +317,7 @@ def _reasons(run: Indicators) -> list[str]:
         reasons.append(_why_points(run))
     if 0 < run.points < LEAST_POINTS and math.isnan(run.matched):
         reasons.append(
-            f"{run.points} known depths cannot fix both scale and shift; give at least {LEAST_POINTS}."
+            f"Too few known depths to fix scale and shift: {run.points}; give at least {LEAST_POINTS}."
         )
     if run.scale_spread > MOST_SCALE_SPREAD and run.points < LEAST_POINTS:
         misses = f"E misses the matches by {run.given_px:.0f} px: is it of this pair? "

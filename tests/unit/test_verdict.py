@@ -56,7 +56,7 @@ def test_a_good_run_is_trusted_in_silence():
         ({"points_ratio": 3.0, "points": 99}, "3 times as far"),
         ({"epipolar_px": 9.5}, "9.5 px off"),
         ({"epipolar_px": 1.5, "confidence": 0.45}, "Likely causes"),
-        (ONE_POINT, "1 known depths cannot fix both scale and shift"),
+        (ONE_POINT, "Too few known depths to fix scale and shift: 1;"),
         (
             {"points": 99, "cover": 1.0, "matched": math.nan, "order": 0.1},
             "known depths disagree",
