@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -97,9 +98,9 @@ def _ends_of_image(
         # Later steps start from the first one's ends; reliable matches show if that basin is still best.
         ends = current
     else:
-        volume, bounds = evidence.volume, config.depth_range
-        search = search_scale(volume, floored, space, depth_range=bounds, current=current, valid=valid)
-        ends, on_edge = (search.near_m, search.far_m), search.on_edge
+        search = partial(search_scale, depth_range=config.depth_range, current=current, valid=valid)
+        near, far, on_edge = search(evidence.volume, floored, space)
+        ends = near, far
     if reliable is not None and evidence.matches is not None:
         # A poor prior's true basin is shallow in raw costs; matches separate basins at that error.
         ends = refine_to_matches(floored, evidence.matches, *ends, space)

@@ -116,6 +116,7 @@ def _as_list(given: Any) -> list[Tensor]:
         cure = "pipe(left, depth_map=array, guidance=...), or --prior-map FILE."
         bad_value("depth_map", "given with the prior 'map'", "nothing", cure)
     if isinstance(given, (np.ndarray, Tensor)):
+        given = given[..., 0] if given.ndim == 3 and given.shape[-1] == 1 else given  # (H, W, 1)
         given = [given] if given.ndim == 2 else list(given)
     if not isinstance(given, (list, tuple)) or not all(isinstance(m, (np.ndarray, Tensor)) for m in given):
         bad_type("depth_map", "an array (h, w) or (N, h, w), or a list of arrays (h, w)", given)

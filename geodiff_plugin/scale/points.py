@@ -141,8 +141,8 @@ class _Fitted(NamedTuple):
     """
 
     inverse: Tensor
-    trusted: Tensor
-    doubt: Tensor
+    confidence: Tensor
+    deviation: Tensor
     noise: Tensor
 
 
@@ -163,10 +163,10 @@ def _refine_once(
     above = mapped + fitted.noise
     residual = ((fitted.inverse + fitted.noise) / above).log().clamp(-1.0, 1.0)
     slope = mapped / above * (log_depth(v + h) - log_depth(v - h)) / (2.0 * h)
-    left_over = 1.4826 * weighted_quantile(residual.abs(), fitted.trusted.expand_as(residual), 0.5)
+    left_over = 1.4826 * weighted_quantile(residual.abs(), fitted.confidence.expand_as(residual), 0.5)
     floor = left_over.clamp_min(FIT_FLOOR)[:, None]
-    variance = (fitted.doubt * fitted.noise / above) ** 2 + floor**2
-    weight = fitted.trusted / (variance * (1.0 + residual**2 / (FIT_CAUCHY**2 * variance)))
+    variance = (fitted.deviation * fitted.noise / above) ** 2 + floor**2
+    weight = fitted.confidence / (variance * (1.0 + residual**2 / (FIT_CAUCHY**2 * variance)))
     J = slope[..., None] * shares
     normal = torch.einsum("bpi,bp,bpj->bij", J, weight, J)
     gradient = torch.einsum("bpi,bp,bp->bi", J, weight, residual)

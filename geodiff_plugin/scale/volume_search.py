@@ -31,18 +31,6 @@ KEEP_MARGIN = 2e-3
 IN_VIEW_RECTIFIED, IN_VIEW_POSED = 0.6, 0.25
 
 
-class ScaleSearch(NamedTuple):
-    """Result of a search, ``(B,)`` each: metres of both ends, and the mean clamped census cost there.
-
-    ``on_edge``: the best pair touches the far end of the range, or the near end of a given range.
-    """
-
-    near_m: Tensor
-    far_m: Tensor
-    cost: Tensor
-    on_edge: Tensor
-
-
 class Groups(NamedTuple):
     """Pixels of a map, sorted by value, in ``K`` groups: a candidate is then tested by ``K`` lookups."""
 
@@ -92,10 +80,11 @@ def search_scale(
     depth_range: tuple[float, float] | None = None,
     current: tuple[Tensor, Tensor] | None = None,
     valid: Tensor | None = None,
-) -> ScaleSearch:
-    """Depths of the two ends of a relative map that the two views agree on best.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Depths of the two ends of relative maps that the two views agree on best, ``(B,)`` metres each.
 
-    1128 pairs (near, far), log-spaced, then two finer grids around the best.
+    1128 pairs (near, far), log-spaced, then two finer grids around the best. With them comes whether the best
+    pair touches the far end of the range, or the near end of a given range.
 
     Args:
         volume: plane-sweep costs of the image.
@@ -140,8 +129,9 @@ def search_scale(
             )
         # The volume's near end lies nearer than any match, so only a given range can cut the scene off.
         on_edge = (far >= high * 0.98) | ((near <= low * 1.02) & (depth_range is not None))
-        results.append((near, far, mean, on_edge))
-    return ScaleSearch(*(torch.cat(column) for column in zip(*results, strict=True)))
+        results.append((near, far, on_edge))
+    near, far, on_edge = (torch.cat(column) for column in zip(*results, strict=True))
+    return near, far, on_edge
 
 
 def _coarse_to_fine(

@@ -223,13 +223,14 @@ def searched() -> dict[str, object]:
         for space, values in (("disparity", x), ("depth", 1.0 - x), ("log", 1.0 - x)):
             if space != "disparity" and name != "free":
                 continue
-            found = search_scale(volume(), values, space, **options)
-            result |= {
-                f"{name}_{space}_{key}": value for key, value in found._asdict().items() if key != "on_edge"
-            }
-            result[f"{name}_{space}_on_edge"] = str(found.on_edge.tolist())
-    far = search_scale(volume(1), torch.full_like(x, 0.5) + 0.02 * _noise(1, 1, *SIZE), "disparity")
-    return result | {"flat_cost": far.cost}
+            near, far, on_edge = search_scale(volume(), values, space, **options)
+            result |= {f"{name}_{space}_near_m": near, f"{name}_{space}_far_m": far}
+            result[f"{name}_{space}_on_edge"] = str(on_edge.tolist())
+    made = volume()
+    seen = made.in_view.clone()
+    seen[2:, :, : seen.shape[-1] * 3 // 10] = False  # of near planes the right view shows 70 %
+    near, far, _ = search_scale(replace(made, in_view=seen), x, "disparity")
+    return result | {"seen_near": near, "seen_far": far}
 
 
 @part
