@@ -115,7 +115,7 @@ def check_baseline(E: np.ndarray, name: str, unit: str | None) -> None:
         cure = "Without it two views do not tell the scale; give the distance between the cameras in metres."
         bad_value(name, expected, f"a translation of {baseline:.1g} m", cure)
     if unit == "m" and baseline > LONG_BASELINE_M:
-        cure = "If that is millimetres, divide the translation, or baseline_m (--baseline), by 1000."
+        cure = "If that is millimetres, divide E, or baseline_m (--baseline, --metres-per-unit), by 1000."
         warn(f"{name} has a baseline of {baseline:.4g} m. {cure}", doubt=True)
 
 

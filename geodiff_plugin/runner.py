@@ -245,6 +245,7 @@ class Runner:
                 elif not self._look_again():
                     break
         finally:
+            bar.update(len(self._records()) - bar.n)  # with what other processes did
             bar.close()
             for pool in pools:  # every stage ends what it is at, and hands it on
                 pool.shutdown(cancel_futures=True)

@@ -82,20 +82,18 @@ class Capture:
         """The frame of a name; ``InputError`` where there is none."""
         if name not in self.names:
             some = ", ".join(self.names[:3])
-            cure = "Names are file stems."
+            cure = "Names are file stems; numbers are FIRST:LAST."
             bad_value("a frame", f"a name of the capture, such as {some}", repr(name), cure)
         return self.files.frames[self.names.index(name)]
 
     def choose(self, wanted: str | None) -> list[str]:
         """Names of ``NAME,NAME`` or ``FIRST:LAST:STEP``; all for ``None``."""
-        if wanted is None:
-            return list(self.names)
+        wanted = ":" if wanted is None else wanted
         if ":" not in wanted:
             return [self.frame(name.strip()).name for name in wanted.split(",") if name.strip()]
         numbers = re.fullmatch(r"(\d*):(\d*)(?::0*([1-9]\d*))?", wanted)
-        first, last, step = (
-            (int(part) if part else None for part in numbers.groups()) if numbers else (0, -1, 1)
-        )
+        parts = numbers.groups() if numbers else ("1", "0", "1")
+        first, last, step = (int(part) if part else None for part in parts)
         last = len(self) - 1 if last is None else last
         if not (first or 0) <= last < len(self):
             expected = f"NAME,NAME or FIRST:LAST:STEP, rising numbers from 0 to {len(self) - 1}"
@@ -188,8 +186,7 @@ class Capture:
         check_choice(points, "points", POINTS)
         of = {"model": "points", "depth": "depth"}.get(points)
         if of and all(getattr(frame, of) is None for frame in self.files.frames):
-            got = f"{points!r} for a {self.files.kind} without"
-            bad_value("points (--points)", "known depths that the capture has", got)
+            bad_value("points (--points)", "known depths that the capture has", repr(points))
         if of and self.unit is None and not scaled:
             cure = "Give --metres-per-unit, --known-length or --distance."
             bad_value("points (--points)", "of a capture whose scale is known", "one without a unit", cure)

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from geodiff_plugin import plotting
-from geodiff_plugin._checks import InputFileError, bad_value, warn
+from geodiff_plugin._checks import InputFileError, warn
 from geodiff_plugin.capture.agreement import DepthFrame, agreed, scene_poses, steadied
 from geodiff_plugin.capture.capture import Capture, choose_neighbours
 from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb, write_vertices
@@ -260,11 +260,9 @@ def write_map(path: Path, values: np.ndarray) -> None:
 def write_mesh(
     path: Path, names: Sequence[str], load: Callable[[str], DepthFrame], image: Callable[[str], np.ndarray]
 ) -> None:
-    """Write a mesh of all frames by TSDF (extra ``mesh``); ``InputError`` where Open3D is not installed."""
-    try:
-        import open3d
-    except ImportError:
-        bad_value("open3d", "installed for a mesh", "missing", "pip install 'geodiff-plugin[mesh]'")
+    """Write a mesh of all frames by TSDF (extra ``mesh``)."""
+    import open3d
+
     core, tensors = open3d.core, open3d.t.geometry
     voxel = MESH_SHARE * float(np.median([np.median(load(name).depth) for name in names]))
     kinds = ("tsdf", "weight", "color"), (core.float32,) * 3, ((1,), (1,), (3,))

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,8 @@ def open_capture(options: CaptureOptions) -> Capture:
     capture = Capture.open(options.path, K=K, fov=options.fov, trajectory=options.trajectory)
     if options.poses == "given" and capture.poses is None:
         bad_value("--poses given", "used with a capture that has poses", f"{options.path} without")
+    if "mesh" in options.export and find_spec("open3d") is None:
+        bad_value("--export mesh", "used where Open3D is installed", "none", "pip install open3d")
     capture.check_points(options.points, any(getattr(options, way) is not None for way in OF_SCALE))
     _length(capture, options)
     return capture
@@ -269,7 +272,10 @@ def capture_report(options: CaptureOptions) -> Record:
         say(f"warning: {note}")
     frames = _run_frames(capture, options, names, factor)
     seconds["frames"] = round(time.perf_counter() - started - seconds["poses"], 1)
-    done = [report["frame"] for report in frames if report.get("status") != BROKEN]
+    failed = [report["key"] for report in frames if report.get("status") == BROKEN]
+    done = [name for name in names if name not in failed]
+    if not done:
+        raise InputError(f"No frame got depth: {frames[0]['error']}")
     agreement = write_agreement(capture, options.out, done)
     doubted = [f["frame"] for f in frames if "verdict" in f and f["verdict"]["status"] != "trusted"]
     files = write_results(capture, options.out, done, options.export, doubted)
@@ -283,6 +289,8 @@ def capture_report(options: CaptureOptions) -> Record:
         "seconds": seconds,
         "files": files,
         "agreement": agreement,
+        "notes": list(capture.files.notes),
+        "failed": failed,
         "not_trusted": doubted,
         "frames": frames,
     }
@@ -315,7 +323,7 @@ def run_capture(options: CaptureOptions) -> None:
     with collected_warnings():
         report = capture_report(options)
     print(json.dumps(report, indent=2) if options.json else summary(report, options.out))
-    if any("error" in frame for frame in report["frames"]) or (options.strict and report["not_trusted"]):
+    if report["failed"] or (options.strict and report["not_trusted"]):
         sys.exit(EXIT_SOME_FAILED)
 
 

@@ -268,8 +268,7 @@ class CaptureOptions(PriorOptions):
     poses: str = _camera("refined", "refined (solved together) or given.", choices=("refined", "given"))
     points: str = declare(
         "tracks",
-        "Known depths: tracks (points of the pose solve), none, model (points of a COLMAP model), depth "
-        "(maps of the capture).",
+        "Known depths: tracks (pose solve), none, model (COLMAP), depth (maps).",
         choices=POINTS,
     )
     metres_per_unit: float | None = _camera(None, "Metres of a unit of the poses.", above_0="metres")

@@ -301,6 +301,8 @@ def run_submit(results: Sequence[Path], to: str, out: Path, method: str) -> None
     scenes: set[Path] = set()
     for folder in folders:
         report = read_report(folder)
+        if "inputs" not in report:
+            bad_value("RESULT", "made by geodiff depth", folder)
         K_left, K_right, E = (np.array(report["inputs"][n], np.float64) for n in ("K_left", "K_right", "E"))
         depth_m = read_npy(folder / "depth.npy", "RESULT", "a depth map")
         disparity = disparity_of_depth(depth_m, K_left, K_right, E)

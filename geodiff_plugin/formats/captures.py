@@ -103,17 +103,21 @@ def read_capture(
     if tracked:
         skipped["no pose"] = [frame.name for frame in frames if frame.E is None]
         frames = [frame for frame in frames if frame.E is not None]
-    notes = tuple(
+    notes = [
         f"{', '.join(names[:5])}{', ...' * (len(names) > 5)}: {why}; {len(names)} skipped."
         for why, names in skipped.items()
         if names
-    )
+    ]
+    if K is None and fov is None and any(c is SEVEN_SCENES or c is TUM_RGBD for _, c in whole):
+        notes.append(f"Assumed: K of the cameras of {kind}, 525 px at 640x480. Give --K for another.")
+    if kind == "video" and trajectory is None:
+        notes.append("No --trajectory: the poses are estimated, without a unit.")
     if len({frame.name for frame in frames}) < len(frames):  # of two folders, whose names tell them apart
         frames = [replace(frame, name=f"{frame.image.parent.name}-{frame.name}") for frame in frames]
     if len(frames) < 2:
         cure = "One frame has no second view: use geodiff depth with known points, or record more."
         bad_value("a capture", "at least two frames", f"{len(frames)} in {source}", cure)
-    return CaptureFiles(tuple(frames), kind, unit if tracked else None, notes)
+    return CaptureFiles(tuple(frames), kind, unit if tracked else None, tuple(notes))
 
 
 def _finished(

@@ -194,10 +194,7 @@ def _in_convention(base: Reconstruction, E: np.ndarray, notes: list[str]) -> np.
     best = min(misfit, key=lambda name: misfit[name])
     if not misfit[best] < CONVENTION_GAIN * misfit["as given"]:
         return E
-    notes.append(
-        f"The poses are read as {best}: as they stand, the matches contradict them, by residual or by points "
-        "behind the cameras."
-    )
+    notes.append(f"The poses are read as {best}: as written, the matches contradict them.")
     return forms[best]
 
 
@@ -277,7 +274,10 @@ def _scaled(
     weights = np.array([s**-2.0 if math.isfinite(s) else 0.0 for s in spreads])
     values = np.nan_to_num([depth[0], trajectory[0]])
     scale = math.exp(float((weights * values).sum() / max(weights.sum(), 1e-12)))
-    _, Q = _similarity(centres, given)
+    # Directions of view count more than places: places on a line leave a turn about it open.
+    reach = 3.0 * float(np.median(np.linalg.norm(given - np.median(given, axis=0), axis=1)))
+    known = (scale * centres, result.E), (given, result.E_given)
+    _, Q = _similarity(*(np.concatenate([c, *(c + reach * E[:, :3, k] for k in range(3))]) for c, E in known))
     turned = scale * centres @ Q.T
     shift = np.median(given - turned, axis=0)
     E = result.E.copy()
@@ -350,18 +350,16 @@ def _noted(result: SolvedCapture, notes: list[str], names: Sequence[str]) -> Sol
     ratio, spread = result.scale_trajectory / result.scale_depth, result.scale_spread
     if abs(math.log(ratio)) > DISAGREES:
         notes.append(
-            "The given positions and the depth of the scene under the given poses disagree on the scale, "
-            f"by {100 * abs(ratio - 1):.0f} %; the scale in use lies between."
+            "The given positions, and the depth of the scene under the given poses, give scales that are "
+            f"{100 * abs(ratio - 1):.0f} % apart; their mean is used. Give --known-length for an exact one."
         )
     if spread > DISAGREES:
         notes.append(f"The scale is uncertain by {100 * spread:.0f} %: give --known-length for an exact one.")
     lost = [name for name, connected in zip(names, result.connected, strict=True) if not connected]
     if lost and result.status != "given":
         kept = "have no pose and are skipped" if result.E_given is None else "keep their poses as given"
-        notes.append(
-            f"{len(lost)} of {len(names)} frames share too few points with others, or fit no better "
-            f"where the others put them, and {kept}: {_some_names(lost)}."
-        )
+        kept = f"share too few points or fit worse when moved, and {kept}"
+        notes.append(f"{len(lost)} of {len(names)} frames {kept}: {_some_names(lost)}.")
     return replace(result, notes=tuple(notes))
 
 

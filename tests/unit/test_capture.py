@@ -1,7 +1,6 @@
 """Poses of a capture solved together, neighbours, agreement and fusion, on a painted room."""
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -80,7 +79,7 @@ def test_inexact_poses_are_mended_and_the_scale_kept():
     assert turn_error_deg(found.E) < 0.15 * turn_error_deg(GIVEN)
     assert np.abs(depth_ratios(found) - 1).max() < 0.06
     assert 0 < found.scale_spread < 0.1
-    assert max(found.moved()[0]) < 0.2 and max(found.moved()[1]) < 12
+    assert max(found.moved()[0]) < 0.2 and max(found.moved()[1]) < 5
 
 
 def test_exact_poses_are_kept_bit_for_bit_and_given_ones_on_demand():
@@ -184,10 +183,10 @@ def test_maps_are_in_colmaps_bytes(tmp_path):
 
 
 def test_a_mesh_lies_on_the_walls_or_says_what_is_missing(fused, tmp_path, monkeypatch):
+    with monkeypatch.context() as without, pytest.raises(InputError, match="Open3D is installed"):
+        without.setattr(run, "find_spec", lambda _: None)
+        run.open_capture(CaptureOptions(path=write_transforms(tmp_path, TRUE, GIVEN), export=("mesh",)))
     job = tmp_path / "mesh.ply", *fused
-    with monkeypatch.context() as without, pytest.raises(InputError, match=r"geodiff-plugin\[mesh\]"):
-        without.setitem(sys.modules, "open3d", None)
-        write_mesh(*job)
     open3d = pytest.importorskip("open3d")
     write_mesh(*job)
     corners = np.asarray(open3d.io.read_triangle_mesh(str(job[0])).vertices)
