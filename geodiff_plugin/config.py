@@ -171,7 +171,7 @@ class GuidanceConfig:
         match_noise: relative error of a perfect match.
         outlier_width: standard deviations from its region beyond which a match counts for less.
         rule: how a gradient moves the latent, scale and shift: `plain`; `summed`, plain, but the latent
-            follows the loss times its pixels; `adam`; `adam-norm`, Adam on the gradient scaled to
+            follows the loss times the number of pixels; `adam`; `adam-norm`, Adam on the gradient scaled to
             the noise's norm (Marigold-DC).
         step_latents: step size of `rule` on the latent.
         step_affine: step size of `rule` on raw s_hat, t_hat.

@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_number, check_positive
+from geodiff_plugin.formats.clouds import in_8_bits
 from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.formats.out import atomic_path, reason_of
 
@@ -182,7 +183,7 @@ def as_picture(image: Any) -> Image.Image:
         return image.convert("RGB")
     values = np.asarray(image)
     if values.dtype.kind in "fb":
-        values = np.rint(np.clip(np.nan_to_num(values.astype(np.float32)), 0.0, 1.0) * 255).astype(np.uint8)
+        values = in_8_bits(np.nan_to_num(values.astype(np.float32)))
     if values.dtype != np.uint8 or not (values.ndim == 2 or (values.ndim == 3 and values.shape[-1] == 3)):
         expected = "PIL, or (H, W) or (H, W, 3) of uint8, bool or [0, 1]"
         bad_value("images", expected, f"{values.dtype} {values.shape}")

@@ -90,17 +90,14 @@ class CameraView(NamedTuple):
 
 @dataclass(frozen=True)
 class StepReport:
-    """Report of one round of a guided denoising step, with one entry per sample of the batch.
-
-    The loss is that before the updates of the round; a round without updates computes none.
-    """
+    """Report of one round of a guided denoising step, with one entry per sample of the batch."""
 
     step: int  # index of the step in the schedule, from 0
     timestep: float  # the scheduler's
     s_hat: torch.Tensor  # (B,) raw scale before softplus, after the step
     t_hat: torch.Tensor  # (B,) raw shift likewise
     g_s: torch.Tensor  # (B,) global scale in use, metres
-    loss: torch.Tensor | None = None  # (B,) total
+    loss: torch.Tensor | None = None  # (B,) total before the round's updates; None without updates
     terms: dict[str, torch.Tensor] = field(default_factory=dict)  # (B,) unweighted value of each, by name
     visible_fraction: torch.Tensor | None = None  # (B,) pixels that a right view sees; 0 without a view
 

@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -98,8 +97,9 @@ def _ends_of_image(
         # Later steps start from the first one's ends; reliable matches show if that basin is still best.
         ends = current
     else:
-        search = partial(search_scale, depth_range=config.depth_range, current=current, valid=valid)
-        near, far, on_edge = search(evidence.volume, floored, space)
+        near, far, on_edge = search_scale(
+            evidence.volume, floored, space, depth_range=config.depth_range, current=current, valid=valid
+        )
         ends = near, far
     if reliable is not None and evidence.matches is not None:
         # A poor prior's true basin is shallow in raw costs; matches separate basins at that error.

@@ -91,13 +91,12 @@ class Capture:
         wanted = ":" if wanted is None else wanted
         if ":" not in wanted:
             return [self.frame(name.strip()).name for name in wanted.split(",") if name.strip()]
-        numbers = re.fullmatch(r"(\d*):(\d*)(?::0*([1-9]\d*))?", wanted)
-        parts = numbers.groups() if numbers else ("1", "0", "1")
-        first, last, step = (int(part) if part else None for part in parts)
-        last = len(self) - 1 if last is None else last
-        if not (first or 0) <= last < len(self):
+        match, every = re.fullmatch(r"(\d*):(\d*)(?::0*([1-9]\d*))?", wanted), (0, len(self) - 1, 1)
+        numbers = match and [int(n or default) for n, default in zip(match.groups(), every, strict=True)]
+        if not numbers or not numbers[0] <= numbers[1] < len(self):
             expected = f"NAME,NAME or FIRST:LAST:STEP, rising numbers from 0 to {len(self) - 1}"
             bad_value("frames (--frames)", expected, repr(wanted))
+        first, last, step = numbers
         return self.names[first : last + 1 : step]
 
     @property

@@ -51,7 +51,7 @@ def _depth(options: DepthOptions) -> None:
 
     if not is_bag(options.left):
         names = ("topic_left", "topic_right", "tolerance", "encoding")
-        options.refuse(names, "left out where LEFT is not a bag", cure="Only bags have topics and stamps.")
+        options.refuse(names, "left out where LEFT is not a bag", cure="It is for bags.")
     if is_bag(options.left):
         failed = _imported("cli.many.run_bag")(options)
     elif is_many(options.left):

@@ -59,9 +59,9 @@ def run_bench(device: str) -> None:
     where = f"{place}, {torch.get_num_threads()} threads, torch {torch.__version__}"
     pipe, cameras = load_guided_prior("bundled", place), (pair.rig.K_left, pair.rig.K_right)
     guidance = GeometryGuidance(pair.right, cameras, pair.rig.E)
+    steps = guidance.denoising_steps(None, 1)
     table, fastest = new_table(("", "seconds", "time x")), list[float]()
     for name, given in (("plain", None), ("guided", guidance)):
-        steps = guidance.denoising_steps(None, 1)
         call = partial(pipe, pair.left, guidance=given, num_inference_steps=steps)
         fastest.append(min(timed(call, place) for _ in range(CALLS)))
         table.add_row(name, f"{fastest[-1]:.2f}", f"{fastest[-1] / fastest[0]:.2f}")

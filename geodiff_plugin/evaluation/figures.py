@@ -105,14 +105,13 @@ def draw_inner_steps(options: FigureOptions) -> Drawing:
     figure = _new_figure(7.6, 3.1)
     figure.suptitle(count_of_pairs(len(refs)), fontsize=9)
     panels = figure.subplots(1, 2)
-    numbers: dict[str, Any] = {"samples": [ref.label for ref in refs]}
+    numbers: dict[str, Any] = {"samples": [ref.label for ref in refs], "updates": updates}
     errors = _curves(panels[0], updates, groups, headline)
     seconds = _curves(panels[1], updates, groups, itemgetter("seconds"))
     for axes, title in zip(panels, ("AbsRel", "seconds a pair"), strict=True):
         _name_axes(axes, "updates per denoising step", title, updates)
         axes.set_ylim(bottom=0)
     panels[1].legend(fontsize=8)
-    numbers["updates"] = updates
     return figure, numbers | {p: {"abs_rel": errors[p], "seconds": seconds[p]} for p in PRESETS}
 
 

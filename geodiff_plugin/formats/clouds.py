@@ -102,10 +102,10 @@ def _cloud_strips(
         use = _usable(z, None if valid is None else valid[rows])
         v, u = np.nonzero(use)
         points = np.stack([u, v + rows.start, np.ones_like(u)], axis=-1) @ unproject * z[use][:, None]
-        yield points, _bytes(image_01[rows][use])
+        yield points, in_8_bits(image_01[rows][use])
 
 
-def _bytes(image: np.ndarray) -> np.ndarray:
+def in_8_bits(image: np.ndarray) -> np.ndarray:
     """Colours in 8 bits, of uint8 or of floats in [0, 1]."""
     return image if image.dtype == np.uint8 else np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
 
@@ -139,7 +139,7 @@ def make_mesh(
     whole = cut[:-1, :-1] == 0
     faces = np.concatenate([np.stack(part, -1)[whole] for part in ((a, c, b), (b, c, d))])
     uv = np.stack([(u + 0.5) / sides[1], 1.0 - (v + 0.5) / sides[0]], -1)
-    texture = Image.fromarray(_bytes(np.asarray(image_01)))
+    texture = Image.fromarray(in_8_bits(np.asarray(image_01)))
     texture.format = "JPEG"  # makes trimesh store it as one
     material = PBRMaterial(baseColorTexture=texture, metallicFactor=0.0, doubleSided=True)
     visual = TextureVisuals(uv=uv.reshape(-1, 2), material=material)

@@ -274,7 +274,7 @@ def _scaled(
     weights = np.array([s**-2.0 if math.isfinite(s) else 0.0 for s in spreads])
     values = np.nan_to_num([depth[0], trajectory[0]])
     scale = math.exp(float((weights * values).sum() / max(weights.sum(), 1e-12)))
-    # Directions of view count more than places: places on a line leave a turn about it open.
+    # Directions of view count three times as much as places: places on a line leave a turn about it open.
     reach = 3.0 * float(np.median(np.linalg.norm(given - np.median(given, axis=0), axis=1)))
     known = (scale * centres, result.E), (given, result.E_given)
     _, Q = _similarity(*(np.concatenate([c, *(c + reach * E[:, :3, k] for k in range(3))]) for c, E in known))

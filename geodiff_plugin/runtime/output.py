@@ -289,9 +289,14 @@ def _indicators(
     )
 
 
+def image_labels(count: int) -> list[str]:
+    """What a sentence about each of so many images begins with."""
+    return [""] if count == 1 else [f"Image {i}: " for i in range(1, count + 1)]
+
+
 def _warnings(run: GuidedRun, visible: Tensor | None, verdicts: Sequence[Verdict]) -> list[str]:
     warnings = []
-    for i, verdict in enumerate(verdicts):
+    for i, (label, verdict) in enumerate(zip(image_labels(len(verdicts)), verdicts, strict=True)):
         sentences = [] if verdict.trusted else [verdict.sentence]
         sentences += verdict.remarks
         share = 1.0 if visible is None else visible[i].float().mean().item()
@@ -302,6 +307,5 @@ def _warnings(run: GuidedRun, visible: Tensor | None, verdicts: Sequence[Verdict
             )
         reasons = {INVERSE, *verdict.indicators.mistakes}  # mistakes of a pose are in the verdict already
         sentences += [sentence for sentence in run.evidence[i].warnings if sentence not in reasons]
-        prefix = "" if len(verdicts) == 1 else f"Image {i + 1}: "
-        warnings += [prefix + sentence for sentence in sentences]
+        warnings += [label + sentence for sentence in sentences]
     return warnings

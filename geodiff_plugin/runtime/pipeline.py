@@ -22,7 +22,7 @@ from geodiff_plugin.priors.pipeline import RESAMPLING, DepthDiffusionPipeline
 from geodiff_plugin.runtime.estimate import ProcessingGrid, tiny_autoencoder
 from geodiff_plugin.runtime.hooks import Exclusive, networks_of
 from geodiff_plugin.runtime.noise_levels import check_scheduler
-from geodiff_plugin.runtime.output import assemble_output, ensemble_metric
+from geodiff_plugin.runtime.output import assemble_output, ensemble_metric, image_labels
 from geodiff_plugin.runtime.run import GuidedRun, StepCallback, depth_prompt
 
 #: What every stock pipeline's call takes, whatever the prior.
@@ -91,8 +91,8 @@ class GuidedCall(_Stock):
                 run, stock = self._call_guided(call, guidance, callback_on_step_end, held)
                 with torch.autocast(self._execution_device.type, enabled=False):
                     output = assemble_output(stock, run, guidance, call, guidance.warned | warned)
-        sentences = tuple(verdict.sentence for verdict in output.verdicts if not verdict.trusted)
-        untrusted = [warning for warning in output.warnings if sentences and warning.endswith(sentences)]
+        labelled = zip(image_labels(len(output.verdicts)), output.verdicts, strict=True)
+        untrusted = [label + verdict.sentence for label, verdict in labelled if not verdict.trusted]
         if strict and untrusted:
             refuse(" ".join(untrusted))
         if output.verdict.status == "not trusted":

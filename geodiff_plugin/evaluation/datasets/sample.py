@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from geodiff_plugin._camera_checks import check_metres
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats import read_depth_png, read_image
+from geodiff_plugin.formats.clouds import in_8_bits
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.types import Rig
@@ -115,7 +116,7 @@ def depth_to_disparity(depth_m: Array, K_left: Array, K_right: Array, E: Array) 
 def read_rgb(path: Path, name: str) -> Array:
     """``(H, W, 3)`` uint8 of an image file, grey repeated; errors as ``formats.read_image``."""
     image_01, _ = read_image(path, name)
-    return np.rint(image_01 * 255.0).astype(np.uint8)
+    return in_8_bits(image_01)
 
 
 def read_depth_m(path: Path, name: str) -> Array:
