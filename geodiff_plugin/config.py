@@ -11,7 +11,7 @@ import json
 import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import Field, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -21,24 +21,6 @@ from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_flag
 DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "points": 1.0, "prior_pull": 0.01, "anchor": 1.0}
 #: The least value where 0 is not allowed.
 TINY = 1e-9
-
-
-class Knob(NamedTuple):
-    """What is known about one field of the configuration, beside the sentence on what it does.
-
-    ``values`` are its range in words; ``check`` gives the value as it is kept; ``paper`` is what the paper
-    says of it, with ``"{}"`` for the value of ``PAPER``; ``unset`` what ``None`` becomes, empty for no value.
-    """
-
-    values: str
-    check: Callable[[Any, str], Any]
-    paper: str = "{}"
-    unset: str = ""
-
-    @classmethod
-    def of(cls, described: Field[Any]) -> Knob:
-        """The description of a field."""
-        return described.metadata["knob"]
 
 
 class _FrozenDict(dict[str, Any]):
@@ -56,12 +38,19 @@ class _FrozenDict(dict[str, Any]):
         return _FrozenDict, (dict(self),)
 
 
-def _knob(default: Any, values: str, check: Callable[[Any, str], Any], **more: str) -> Any:
-    knob = Knob(values, check, **more)
-    if knob.unset:
-        checked: Callable[[Any, str], Any] = lambda v, name: None if v is None else check(v, name)  # noqa: E731
-        knob = knob._replace(values=f"{values}, or `None`", check=checked)
-    return field(default=default, metadata={"knob": knob})
+def _knob(
+    default: Any, values: str, check: Callable[[Any, str], Any], paper: str = "{}", unset: str = ""
+) -> Any:
+    """A field with what is known about it beside the sentence on what it does.
+
+    ``values`` are its range in words; ``check`` gives the value as it is kept; ``paper`` is what the paper
+    says of it, with ``"{}"`` for the value of ``PAPER``; ``unset`` what ``None`` becomes, empty for no value.
+    """
+    checked: Callable[[Any, str], Any] = lambda v, name: None if unset and v is None else check(v, name)  # noqa: E731
+    values += ", or `None`" if unset else ""
+    return field(
+        default=default, metadata={"values": values, "check": checked, "paper": paper, "unset": unset}
+    )
 
 
 def _number(default: float | None, low: float, high: float, kind: type = float, **more: str) -> Any:
@@ -228,7 +217,7 @@ class GuidanceConfig:
 
     def __post_init__(self) -> None:
         for described in fields(self):
-            value = Knob.of(described).check(getattr(self, described.name), described.name)
+            value = described.metadata["check"](getattr(self, described.name), described.name)
             object.__setattr__(self, described.name, value)
         check_number(self.start, "start", 0.0, self.stop)
 
@@ -431,10 +420,10 @@ def knob_lines() -> list[str]:
     """For a terminal: the sections, and of every knob a line with its default, range and what it does."""
     lines: list[str] = []
     for described in fields(GuidanceConfig):
-        name, knob, value = described.name, Knob.of(described), getattr(DEFAULT, described.name)
+        name, knob, value = described.name, described.metadata, getattr(DEFAULT, described.name)
         lines += ["", SECTIONS[name]] if name in SECTIONS else []
         # A terminal has no use for links and marks.
         sentence = re.sub(r" \(\[[^]]*\]\([^)]*\)\)", "", sentences().get(name, ""))
-        default = knob.unset if value is None else shown(value)
-        lines.append(f"  {name} = {default}  [{knob.values}]  {sentence}".replace("`", ""))
+        default = knob["unset"] if value is None else shown(value)
+        lines.append(f"  {name} = {default}  [{knob['values']}]  {sentence}".replace("`", ""))
     return lines[1:]

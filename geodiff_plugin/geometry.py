@@ -7,7 +7,6 @@ comment says why it is not used.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -83,15 +82,9 @@ def is_rectified(K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> 
     return (turned <= ANGLE_TOLERANCE) & sideways & (uneven <= ANGLE_TOLERANCE * K_left[..., 1, 1])
 
 
-class PlaneRays(NamedTuple):
-    """Where a left pixel goes in the right view, as a line in its depth: ``p = z * A + b``.
-
-    ``A (B, 3, H * W)`` is the homogeneous right pixel of the left pixel's point at infinity, ``b (B, 3, 1)``
-    that of the left camera's centre (the epipole).
-    """
-
-    A: Tensor
-    b: Tensor
+#: Where a left pixel goes in the right view, as a line ``z * A + b`` in its depth z: ``A (B, 3, H * W)`` is
+#: the homogeneous right pixel of its point at infinity, ``b (B, 3, 1)`` that of the left camera's centre.
+PlaneRays = tuple[Tensor, Tensor]
 
 
 def constant_like(like: Tensor, *values: float) -> Tensor:
@@ -153,7 +146,7 @@ def plane_rays(
     M = K_right @ T_right_from_left[:, :3, :3]
     # Not a matrix product, which TF32 rounds by a quarter pixel.
     A = M[..., 2:] + M[..., 1:2] * y + M[..., :1] * x
-    return PlaneRays(A, K_right @ T_right_from_left[:, :3, 3:])
+    return A, K_right @ T_right_from_left[:, :3, 3:]
 
 
 def project_rays(depth_m: Tensor, rays: PlaneRays) -> tuple[Tensor, Tensor]:
@@ -162,7 +155,8 @@ def project_rays(depth_m: Tensor, rays: PlaneRays) -> tuple[Tensor, Tensor]:
     ``depth_m (B, 1, H, W)`` metres lies on the grid of the rays; differentiable in it.
     """
     height, width = depth_m.shape[-2:]
-    p = depth_m.flatten(2) * rays.A + rays.b  # (B, 3, H * W)
+    A, b = rays
+    p = depth_m.flatten(2) * A + b  # (B, 3, H * W)
     z = p[:, 2]
     in_front, z_safe = _in_front(z)
     uv = torch.where(in_front[:, None], p[:, :2] / z_safe[:, None], torch.full_like(p[:, :2], _BEHIND_PX))

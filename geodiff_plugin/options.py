@@ -10,7 +10,7 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import Field, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number, check_positive, refuse
 
@@ -22,6 +22,14 @@ DTYPES = ("float32", "float16", "bfloat16")
 #: Keys of ``scale.space.SPACES``, which cannot be imported without torch; a test keeps them the same.
 SPACES = ("depth", "disparity", "log", "log1p", "sqrt_disparity")
 PRESETS = ("default", "fast", "paper")
+
+
+class Command(NamedTuple):
+    """A command: its options (``None`` for a group, which ``run`` returns), its function and its help."""
+
+    options: type | None
+    run: Callable[[Any], Any]
+    about: str
 
 
 def declare(

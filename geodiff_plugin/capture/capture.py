@@ -15,7 +15,7 @@ import torch
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin._threads import available_cores
 from geodiff_plugin.capture import NEIGHBOURS, POINTS
-from geodiff_plugin.formats.captures import CaptureFiles, CaptureFrame, read_capture
+from geodiff_plugin.formats.captures import CaptureFrame, read_capture
 from geodiff_plugin.formats.depth import read_depth_png
 from geodiff_plugin.formats.images import read_image, undistorted
 from geodiff_plugin.formats.recordings import VideoReader
@@ -43,14 +43,15 @@ class Capture:
     >>> capture = Capture.open("scan")
     >>> out = capture.depth(pipe, "frame_0010")
 
-    ``files`` is what was read, ``names`` those of the frames in order, ``unit`` ``"m"``, or ``None`` where no
-    length is known, ``solved`` what ``solve`` found.
+    ``frames`` are in order, with ``names``; ``kind`` is their layout, ``unit`` ``"m"``, or ``None`` where no
+    length is known; ``notes`` are for the user; ``solved`` is the result of ``solve``.
     """
 
-    def __init__(self, files: CaptureFiles) -> None:
-        self.files = files
-        self.names = [frame.name for frame in files.frames]
-        self.unit = files.unit
+    def __init__(
+        self, frames: Sequence[CaptureFrame], kind: str, unit: str | None, notes: Sequence[str]
+    ) -> None:
+        self.frames, self.kind, self.unit, self.notes = list(frames), kind, unit, list(notes)
+        self.names = [frame.name for frame in frames]
         self.solved: SolvedCapture | None = None
         self._way: str | None = None  # how it was solved
         self._video: VideoReader | None = None
@@ -73,7 +74,7 @@ class Capture:
             FileNotFoundError: nothing there.
             InputError: nothing that is a capture, or fewer than two frames.
         """
-        return cls(read_capture(path, K=K, fov=fov, trajectory=trajectory))
+        return cls(*read_capture(path, K=K, fov=fov, trajectory=trajectory))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -84,7 +85,7 @@ class Capture:
             some = ", ".join(self.names[:3])
             cure = "Names are file stems; numbers are FIRST:LAST."
             bad_value("a frame", f"a name of the capture, such as {some}", repr(name), cure)
-        return self.files.frames[self.names.index(name)]
+        return self.frames[self.names.index(name)]
 
     def choose(self, wanted: str | None) -> list[str]:
         """Names of ``NAME,NAME`` or ``FIRST:LAST:STEP``; all for ``None``."""
@@ -102,7 +103,7 @@ class Capture:
     @property
     def poses(self) -> np.ndarray | None:
         """``(N, 4, 4)`` camera-to-world as given, or ``None``."""
-        Es = [frame.E for frame in self.files.frames]
+        Es = [frame.E for frame in self.frames]
         return None if any(E is None for E in Es) else np.stack([E for E in Es if E is not None])
 
     def solve(self, poses: str | None = None, *, threads: int | None = None) -> SolvedCapture:
@@ -117,7 +118,7 @@ class Capture:
         check_choice(poses or "refined", "poses", ("refined", "given"))
         if self.solved is None or poses not in (None, self._way):
             self._way = poses or "refined"
-            images, frames = map(self.image, self.names), self.files.frames
+            images, frames = map(self.image, self.names), self.frames
             self.solved = solve_capture(
                 (np.rint(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) * 255).astype(np.uint8) for x in images),
                 np.stack([frame.K for frame in frames]),
@@ -134,10 +135,10 @@ class Capture:
         check_number(factor, "metres per unit", 1e-12, 1e12)
         frames, solved, longer = [], self.solved, np.ones((4, 4))
         longer[:3, 3] = factor
-        for frame in self.files.frames:
+        for frame in self.frames:
             points = None if frame.points is None else frame.points * factor
             frames.append(replace(frame, E=None if frame.E is None else frame.E * longer, points=points))
-        self.files, self.unit = replace(self.files, frames=tuple(frames), unit="m"), "m"
+        self.frames, self.unit = frames, "m"
         if solved is not None:
             given = None if solved.E_given is None else solved.E_given * longer
             self.solved = replace(solved, E=solved.E * longer, E_given=given, points=solved.points * factor)
@@ -184,7 +185,7 @@ class Capture:
         """``InputError`` where no frame has such known depths, or they will not be in metres (``scaled``)."""
         check_choice(points, "points", POINTS)
         of = {"model": "points", "depth": "depth"}.get(points)
-        if of and all(getattr(frame, of) is None for frame in self.files.frames):
+        if of and all(getattr(frame, of) is None for frame in self.frames):
             bad_value("points (--points)", "known depths that the capture has", repr(points))
         if of and self.unit is None and not scaled:
             cure = "Give --metres-per-unit, --known-length or --distance."
@@ -215,8 +216,8 @@ class Capture:
         solved = self.solve()
         if solved.status not in ADJUSTED or not solved.connected[number]:
             return None
-        every = np.concatenate([seen.point for seen in solved.seen])
-        seen, frames = solved.seen[number].point, np.bincount(every, minlength=len(solved.points))
+        every = np.concatenate([points for _, points in solved.seen])
+        seen, frames = solved.seen[number][1], np.bincount(every, minlength=len(solved.points))
         xyz = _in_camera(solved.points[seen[frames[seen] >= FEWEST_FRAMES]], solved.E[number])
         ahead = xyz[xyz[:, 2] > 0]
         return ahead if len(ahead) else None
@@ -294,10 +295,11 @@ def choose_neighbours(
 
 def _values(solved: SolvedCapture, frame: int) -> np.ndarray:
     """``(N, P)`` worth of the frame's points to every other frame, 0 where it does not see them."""
-    points, values = solved.seen[frame].point, np.zeros((len(solved.E), len(solved.seen[frame].point)))
+    _, points = solved.seen[frame]
+    values = np.zeros((len(solved.E), len(points)))
     rays = solved.points[points] - solved.E[frame, :3, 3]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    for other, (E, seen) in enumerate(zip(solved.E, solved.seen, strict=True)):
+    for other, (E, (_, seen)) in enumerate(zip(solved.E, solved.seen, strict=True)):
         if other == frame or not np.isfinite(E).all():
             continue
         back = solved.points[points] - E[:3, 3]
@@ -305,7 +307,7 @@ def _values(solved: SolvedCapture, frame: int) -> np.ndarray:
         angle = np.degrees(np.arccos(np.clip((rays * back).sum(1), -1, 1)))
         width = np.where(angle < BEST_ANGLE_DEG, NARROWER_DEG, WIDER_DEG)
         worth = np.exp(-0.5 * ((angle - BEST_ANGLE_DEG) / width) ** 2)
-        values[other] = worth * np.isin(points, seen.point)
+        values[other] = worth * np.isin(points, seen)
     return values
 
 

@@ -230,21 +230,20 @@ def write_workspace(
     for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps", "stereo/consistency_graphs"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     views, maps, colours = [], folder / "stereo", np.zeros(points.shape, np.uint8)
-    for frame, observed in zip(frames, seen, strict=True):
+    for frame, (px, rows) in zip(frames, seen, strict=True):
         picture = plotting.as_picture(image(frame.name))
         picture.save(folder / "images" / f"{frame.name}.png")
-        u, v = np.rint(observed.px).astype(int).T.clip(0, np.array(picture.size)[:, None] - 1)
-        colours[observed.point] = np.asarray(picture)[v, u]
+        u, v = np.rint(px).astype(int).T.clip(0, np.array(picture.size)[:, None] - 1)
+        colours[rows] = np.asarray(picture)[v, u]
         depth, file = np.where(kept(frame), frame.depth, 0)[..., None], f"{frame.name}.png.geometric.bin"
         write_map(maps / "depth_maps" / file, depth)
         write_map(maps / "normal_maps" / file, normals_of(frame.depth, frame.K))
         views.append((f"{frame.name}.png", frame.K, frame.E, picture.size))
-    rows, counts = np.unique(np.concatenate([observed.point for observed in seen]), return_counts=True)
+    rows, counts = np.unique(np.concatenate([each for _, each in seen]), return_counts=True)
     rows = rows[counts > 1]
     place = np.full(len(points), -1)
     place[rows] = np.arange(len(rows))
-    shared = [place[observed.point] >= 0 for observed in seen]
-    tracks = [(o.px[both], place[o.point[both]]) for o, both in zip(seen, shared, strict=True)]
+    tracks = [(px[place[each] >= 0], place[each][place[each] >= 0]) for px, each in seen]
     write_colmap(folder / "sparse", views, Cloud(points[rows], colours[rows]), tracks)
     write_text(maps / "fusion.cfg", "".join(f"{file}\n" for file, *_ in views))
     write_text(maps / "patch-match.cfg", "".join(f"{file}\n__auto__, 20\n" for file, *_ in views))

@@ -14,11 +14,11 @@ from typing import Annotated, Any
 
 import typer
 
-from geodiff_plugin.cli.commands import Command, new_group
+from geodiff_plugin.cli.commands import new_group
 from geodiff_plugin.cli.options import CaptureOptions, DepthOptions, start_pair
 from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, StopWatch
 from geodiff_plugin.formats.out import free_folder
-from geodiff_plugin.options import OUTPUT, SPACES, declare, help_of
+from geodiff_plugin.options import OUTPUT, SPACES, Command, PriorOptions, declare, help_of
 
 _out = partial(declare, panel=OUTPUT)
 
@@ -97,11 +97,6 @@ class _Info:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Bench:
-    device: str = declare("auto", help_of("device"))
-
-
-@dataclass(frozen=True, kw_only=True)
 class _Video:
     frames: tuple[Path, ...] = declare(MISSING, "Results of geodiff depth, or maps.", "", metavar="FRAME...")
     out: Path = _out(Path("depth.webp"), "The video: .mp4 (OpenCV), .webp or .gif.", "--out", "-o")
@@ -146,7 +141,7 @@ COMMANDS = {
     "capture": Command(CaptureOptions, _capture, "Depth of a capture's frames, and one cloud of all."),
     "demo": Command(_Demo, _Demo.run, "Run on a rendered pair of the package, and print how good it is."),
     "info": Command(_Info, _later("cli.info.run_info"), "Versions, devices, priors and what is cached."),
-    "bench": Command(_Bench, _later("cli.demo.run_bench"), "What guidance costs in seconds."),
+    "bench": Command(PriorOptions, _later("cli.demo.run_bench"), "What guidance costs in seconds."),
     "video": Command(_Video, _later("cli.outputs.run_video"), "Join depth maps of a sequence into a video."),
     "submit": Command(_Submit, _later("cli.outputs.run_submit"), "Write files for Middlebury and ETH3D."),
     "app": Command(_Page, _later("app.launch.run_app"), "Serve a web page to measure on (extra app)."),

@@ -31,7 +31,7 @@ from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, collected_warnings, sa
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
 from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, check_new, write_text
-from geodiff_plugin.pose.capture import Observations, SolvedCapture
+from geodiff_plugin.pose.capture import SolvedCapture
 from geodiff_plugin.runner import BROKEN, Item, Journal, Runner, fingerprint, this_process
 from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.runtime.verdict import UNTESTED
@@ -86,9 +86,8 @@ def _save_solved(path: Path, solved: SolvedCapture, key: str) -> None:
     """Write everything as ``.npz``, under the key of the frames and settings that it is of."""
     arrays = {f.name: getattr(solved, f.name) for f in fields(solved) if f.name not in ("seen", "notes")}
     arrays["E_given"] = np.zeros(0) if solved.E_given is None else solved.E_given
-    arrays["px"] = np.concatenate([seen.px for seen in solved.seen])
-    arrays["point"] = np.concatenate([seen.point for seen in solved.seen])
-    arrays["counts"] = np.array([len(seen.point) for seen in solved.seen])
+    arrays["px"], arrays["point"] = map(np.concatenate, zip(*solved.seen, strict=True))
+    arrays["counts"] = np.array([len(points) for _, points in solved.seen])
     with atomic_path(path) as temporary:
         np.savez_compressed(temporary, key=np.array(key), notes=np.array(solved.notes, np.str_), **arrays)
 
@@ -105,7 +104,7 @@ def load_solved(path: Path, key: str) -> SolvedCapture | None:
         values: dict[str, Any] = {n: a.item() if a.ndim == 0 else a for n, a in arrays.items()}
         values["E_given"] = values["E_given"] if values["E_given"].size else None
         values["notes"] = tuple(map(str, values["notes"]))
-        return SolvedCapture(seen=tuple(map(Observations, px, point)), **values)
+        return SolvedCapture(seen=tuple(zip(px, point, strict=True)), **values)
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -259,7 +258,7 @@ def capture_report(options: CaptureOptions) -> Record:
     started = time.perf_counter()
     capture = open_capture(options)
     names = capture.choose(options.frames)
-    for note in capture.files.notes:
+    for note in capture.notes:
         say(note)
     ours = any((options.out / name).is_file() for name in (POSES_FILE, JOURNAL))
     check_new(options.out, ours or options.overwrite).mkdir(parents=True, exist_ok=True)
@@ -283,13 +282,13 @@ def capture_report(options: CaptureOptions) -> Record:
     report = {
         "version": __version__,
         "path": str(options.path),
-        "kind": capture.files.kind,
+        "kind": capture.kind,
         "unit": capture.unit,
         "poses": _pose_report(capture),
         "seconds": seconds,
         "files": files,
         "agreement": agreement,
-        "notes": list(capture.files.notes),
+        "notes": capture.notes,
         "failed": failed,
         "not_trusted": doubted,
         "frames": frames,

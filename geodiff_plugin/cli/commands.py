@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from inspect import Parameter, Signature
-from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 import typer.main
@@ -14,21 +14,13 @@ from typer.core import TyperGroup
 
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.cli.terminal import EXIT_BAD_INPUT, EXIT_INTERRUPTED, say
-from geodiff_plugin.options import CAMERAS, OUTPUT, RUN, check_options, flag_of
+from geodiff_plugin.options import CAMERAS, OUTPUT, RUN, Command, check_options, flag_of
 
 APPEARANCE: dict[str, Any] = {
     "add_completion": False,
     "pretty_exceptions_enable": False,
     "context_settings": {"help_option_names": ["-h", "--help"]},
 }
-
-
-class Command(NamedTuple):
-    """A command: its options (``None`` for a group, which ``run`` returns), its function and its help."""
-
-    options: type | None
-    run: Callable[[Any], Any]
-    about: str
 
 
 class _Group(TyperGroup):

@@ -11,6 +11,7 @@ from functools import partial
 
 import torch
 
+from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
 from geodiff_plugin.cli.depth import estimate_and_write, load_guided_prior
 from geodiff_plugin.cli.options import DepthOptions
@@ -21,6 +22,7 @@ from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
+from geodiff_plugin.priors import prior_of
 from geodiff_plugin.runtime.machine import pick_device, timed
 
 CELL_WIDTH = 360
@@ -53,21 +55,24 @@ def run_demo(options: DepthOptions, out: OutFolder) -> None:
     print(f"Open {out.path / 'comparison.png'} first: prior, guided depth and truth side by side.")
 
 
-def run_bench(device: str) -> None:
+def run_bench(prior: str, space: str | None, steps: int | None, seed: int, device: str) -> None:
     """Print seconds of a plain and of a guided call, and where the time of a command goes."""
     place, pair = pick_device(device), read_demo_pair()
     where = f"{place}, {torch.get_num_threads()} threads, torch {torch.__version__}"
-    pipe, cameras = load_guided_prior("bundled", place), (pair.rig.K_left, pair.rig.K_right)
+    pipe, cameras = load_guided_prior(prior, place, space), (pair.rig.K_left, pair.rig.K_right)
     guidance = GeometryGuidance(pair.right, cameras, pair.rig.E)
-    steps = guidance.denoising_steps(None, 1)
+    wanted = guidance.denoising_steps(steps, pipe.default_denoising_steps)
+    count, _ = count_steps(wanted, steps, prior_of(pipe).max_steps)
     table, fastest = new_table(("", "seconds", "time x")), list[float]()
     for name, given in (("plain", None), ("guided", guidance)):
-        call = partial(pipe, pair.left, guidance=given, num_inference_steps=steps)
+        call = partial(pipe, pair.left, guidance=given, num_inference_steps=count)
         fastest.append(min(timed(call, place) for _ in range(CALLS)))
         table.add_row(name, f"{fastest[-1]:.2f}", f"{fastest[-1] / fastest[0]:.2f}")
     left, right, calib = (str(DEMO_PAIR_FOLDER / name) for name in ("left.png", "right.png", "calib.txt"))
     with tempfile.TemporaryDirectory() as folder:
         flags = ["--calib", calib, "--device", str(place), "--json", "--quiet", "--out", f"{folder}/out"]
+        for flag, value in {"--prior": prior, "--space": space, "--steps": steps, "--seed": seed}.items():
+            flags += [] if value is None else [flag, str(value)]
         words = [sys.executable, "-m", "geodiff_plugin", "depth", left, right, *flags]
         started = time.perf_counter()
         answer = subprocess.run(words, check=True, capture_output=True, text=True)
@@ -76,4 +81,4 @@ def run_bench(device: str) -> None:
     stages["python"] = whole - sum(stages.values())  # what lies around them
     told = ", ".join(f"{name} {seconds:.1f}" for name, seconds in stages.items())
     command = f"geodiff depth: {sum(stages.values()):.1f} s ({told})"
-    show(f"bundled prior, default guidance; {where}; demo pair", table, command)
+    show(f"prior {prior}, {count} steps, default guidance; {where}; demo pair", table, command)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from geodiff_plugin.cli.commands import Command, new_group
+from geodiff_plugin.cli.commands import new_group
 from geodiff_plugin.cli.terminal import new_table, print_lines, show
 from geodiff_plugin.evaluation.options import COMMANDS
 from geodiff_plugin.formats.out import check_out
-from geodiff_plugin.options import declare
+from geodiff_plugin.options import Command, declare
 
 if TYPE_CHECKING:
     from geodiff_plugin.evaluation.experiment import Page
@@ -25,9 +26,9 @@ class _ListOptions:
     data: Path | None = declare(None, "Folder to look into.")
 
 
-def _run(name: str, options: Any) -> None:
+def _run(measure: Callable[[Any], Any], options: Any) -> None:
     check_out(options.out)
-    result = COMMANDS[name](name, options)
+    result = measure(options)
     if isinstance(result, Path) and not options.quiet:
         typer.echo(result)
     elif result is not None and not options.quiet:
@@ -68,6 +69,6 @@ def _list(options: _ListOptions) -> None:
     print_lines(rows)
 
 
-_COMMANDS = {name: Command(each.options, partial(_run, name), each.about) for name, each in COMMANDS.items()}
+_COMMANDS = {name: each._replace(run=partial(_run, each.run)) for name, each in COMMANDS.items()}
 _COMMANDS["list"] = Command(_ListOptions, _list, "Say which data sets are there; list the methods.")
 eval_app = new_group("Measure this package on data sets, beside other methods.", _COMMANDS)

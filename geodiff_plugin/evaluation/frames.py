@@ -238,9 +238,9 @@ def _of_points(capture: Capture, names: Sequence[str]) -> Record:
     for name in names:
         i = capture.names.index(name)
         truth, known = capture.measured_depth(name)
-        seen, T = solved.seen[i], np.linalg.inv(solved.E[i])
-        z = solved.points[seen.point] @ T[2, :3] + T[2, 3]
-        u, v = np.rint(seen.px).astype(int).T.clip(0, np.array(truth.shape[::-1])[:, None] - 1)
+        (px, seen), T = solved.seen[i], np.linalg.inv(solved.E[i])
+        z = solved.points[seen] @ T[2, :3] + T[2, 3]
+        u, v = np.rint(px).astype(int).T.clip(0, np.array(truth.shape[::-1])[:, None] - 1)
         there = known[v, u] & (z > 0)
         if there.any():
             scores.append(_scores(z[None], truth[v, u][None], there[None]))

@@ -6,10 +6,20 @@ import importlib
 import shlex
 from collections.abc import Collection
 from dataclasses import MISSING, dataclass, field, fields
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from geodiff_plugin.options import DTYPES, OUTPUT, SPACES, PriorOptions, check_options, declare, flag_of
+from geodiff_plugin.options import (
+    DTYPES,
+    OUTPUT,
+    SPACES,
+    Command,
+    PriorOptions,
+    check_options,
+    declare,
+    flag_of,
+)
 
 if TYPE_CHECKING:
     from geodiff_plugin.evaluation.baselines import Settings
@@ -193,37 +203,32 @@ class CaptureEvalOptions(EvalOptions):
     rows: tuple[str, ...] = _some(CAPTURE_ROWS)
 
 
-class Command(NamedTuple):
-    """A command: its options, ``module:function`` in this package, and what it does."""
-
-    options: type[OutOptions]
-    run: str
-    about: str
-
-    def __call__(self, name: str, options: Any) -> Any:
-        """Run it: the page, the path of a figure, or ``None`` in a process that writes nothing."""
-        module, _, function = self.run.partition(":")
-        module = f"geodiff_plugin.evaluation.{module}"
-        return getattr(importlib.import_module(module), function)(name, options)
+def _run(name: str, where: str, options: OutOptions) -> Any:
+    """The page, the path of a figure, or ``None`` in a process that writes nothing."""
+    module, _, function = where.partition(":")
+    return getattr(importlib.import_module(f"geodiff_plugin.evaluation.{module}"), function)(name, options)
 
 
 _PAPER, _CHANGES = "paper:run_paper_table", "pairs:run_changes"
+_TABLE: dict[str, tuple[type[OutOptions], str, str]] = {
+    "pairs": (DirOptions, "pairs:run_pairs", "Methods side by side on every metric pair below DIR."),
+    "table1": (PairsOptions, _PAPER, "Table 1: KITTI, Booster and Middlebury, in metres and aligned."),
+    "table2": (PairsOptions, _PAPER, "Table 2: Booster, beside stereo."),
+    "table3": (PairsOptions, _PAPER, "Table 3: two posed views, Tanks and Temples."),
+    "ablation": (PairsOptions, _PAPER, "Table 4, and one change at a time: gradients, rules, terms."),
+    "parts": (PairsOptions, _CHANGES, "The default with one of its parts left out at a time."),
+    "flatness": (PairsOptions, _CHANGES, "Every number of the default, at half and at twice."),
+    "cost": (PairsOptions, "pairs:run_cost", "Seconds and peak memory, plain against guided."),
+    "strength": (StrengthOptions, "strength:run_strength", "Emulated priors from exact to weak."),
+    "sequence": (SequenceOptions, "frames:run_sequence", "Frames of a moving rig; error, flicker."),
+    "figure": (FigureOptions, "figures:run_figure", "Draw one figure as PNG, its numbers as JSON."),
+    "trust": (TrustOptions, "calibrations:run_trust", "How many wrong calibrations are detected."),
+    "poses": (PosesOptions, "calibrations:run_poses", "Poses given, perturbed, refined, estimated."),
+    "capture": (CaptureEvalOptions, "frames:run_capture_eval", "Depth of a capture (extra capture)."),
+}
 #: Every command but ``list``, by name.
-COMMANDS: dict[str, Command] = {
-    "pairs": Command(DirOptions, "pairs:run_pairs", "Methods side by side on every metric pair below DIR."),
-    "table1": Command(PairsOptions, _PAPER, "Table 1: KITTI, Booster and Middlebury, in metres and aligned."),
-    "table2": Command(PairsOptions, _PAPER, "Table 2: Booster, beside stereo."),
-    "table3": Command(PairsOptions, _PAPER, "Table 3: two posed views, Tanks and Temples."),
-    "ablation": Command(PairsOptions, _PAPER, "Table 4, and one change at a time: gradients, rules, terms."),
-    "parts": Command(PairsOptions, _CHANGES, "The default with one of its parts left out at a time."),
-    "flatness": Command(PairsOptions, _CHANGES, "Every number of the default, at half and at twice."),
-    "cost": Command(PairsOptions, "pairs:run_cost", "Seconds and peak memory, plain against guided."),
-    "strength": Command(StrengthOptions, "strength:run_strength", "Emulated priors from exact to weak."),
-    "sequence": Command(SequenceOptions, "frames:run_sequence", "Frames of a moving rig; error, flicker."),
-    "figure": Command(FigureOptions, "figures:run_figure", "Draw one figure as PNG, its numbers as JSON."),
-    "trust": Command(TrustOptions, "calibrations:run_trust", "How many wrong calibrations are detected."),
-    "poses": Command(PosesOptions, "calibrations:run_poses", "Poses given, perturbed, refined, estimated."),
-    "capture": Command(CaptureEvalOptions, "frames:run_capture_eval", "Depth of a capture (extra capture)."),
+COMMANDS = {
+    name: Command(kind, partial(_run, name, where), about) for name, (kind, where, about) in _TABLE.items()
 }
 
 

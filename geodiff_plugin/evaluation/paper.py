@@ -40,24 +40,23 @@ class Column(NamedTuple):
         return f"{self.title} ({other}{count_of_pairs(len(self.labels))})"
 
 
-class PaperRow(NamedTuple):
-    """One row of a table; files:DIR/unidepth stands for every method with that word after its colon."""
+def _is_outside(method: str) -> bool:
+    """Whether the user names the method of a row."""
+    return method.startswith(("hf:", "files:"))
 
-    title: str
-    aligned: bool
-    method: str
-    published: Mapping[str, Sequence[str]]
 
-    @property
-    def outside(self) -> bool:
-        """Whether the user names the method."""
-        return self.method.startswith(("hf:", "files:"))
+def _filler(method: str, methods: Sequence[str]) -> str:
+    """Which of the methods fills the row of ``method``, empty where none ran.
 
-    def filler(self, methods: Sequence[str]) -> str:
-        """The method that fills the row, empty where none ran."""
-        word = self.method.rpartition("/")[2].partition("-")[0].lower()
-        ran = (n for n in methods if n == self.method or self.outside and word in n.lower().partition(":")[2])
-        return next(ran, "")
+    files:DIR/unidepth stands for every method with that word after its colon.
+    """
+    word = method.rpartition("/")[2].partition("-")[0].lower()
+    ran = (n for n in methods if n == method or _is_outside(method) and word in n.lower().partition(":")[2])
+    return next(ran, "")
+
+
+#: A row of a table: title, whether aligned, method, and the published cells by the title of a column.
+_Row = tuple[str, bool, str, Mapping[str, Sequence[str]]]
 
 
 class Layout(NamedTuple):
@@ -67,7 +66,7 @@ class Layout(NamedTuple):
     columns: tuple[Column, ...]
     methods: tuple[str, ...]
     metrics: tuple[str, ...]
-    rows: tuple[PaperRow, ...]
+    rows: tuple[_Row, ...]
 
 
 #: Metric and its heading; Table 4 has the first two.
@@ -81,7 +80,7 @@ def _layout(text: str, columns: tuple[Column, ...], methods: tuple[str, ...]) ->
     for line in lines:
         name, kind, method, *cells = (part.strip() for part in line.split("|"))
         published = {c.title: of.split() for c, of in zip(columns, cells, strict=True)}
-        rows.append(PaperRow(name, kind == "aligned", method, published))
+        rows.append((name, kind == "aligned", method, published))
     return Layout(title, columns, methods, tuple(METRICS)[: len(cells[0].split())], tuple(rows))
 
 
@@ -146,20 +145,23 @@ def layout_table(
     for column in columns:
         groups.append((column.heading, count))
         groups += [(f"{column.title}, as published", count)] if column.complete else []
-    filled = [(row, row.filler(methods)) for row in layout.rows]
-    empty = [f"{row.title} (--methods {row.method})" for row, method in filled if row.outside and not method]
-    taken = {method for _, method in filled}
+    filled, empty = list[_Row](), list[str]()
+    for title, aligned, method, published in layout.rows:
+        filled.append((title, aligned, _filler(method, methods), published))
+        if _is_outside(method) and not filled[-1][2]:
+            empty.append(f"{title} (--methods {method})")
+    taken = {method for _, _, method, _ in filled}
     for name in (name for name in methods if name not in taken):
         title = find_method(name).title
-        filled += [(PaperRow(f"{title}†", False, name, {}), name)] if values[False][0].get(name) else []
-        filled.append((PaperRow(title, True, name, {}), name))
+        filled += [(f"{title}†", False, name, {})] if values[False][0].get(name) else []
+        filled.append((title, True, name, {}))
     rows = []
-    for row, method in filled:
-        cells = [row.title, "✓" if row.aligned else "✗"]
+    for title, aligned, method, published in filled:
+        cells = [title, "✓" if aligned else "✗"]
         for column in columns:
-            of_method = (metric.get(method, {}) for metric in values[row.aligned])
+            of_method = (metric.get(method, {}) for metric in values[aligned])
             cells += [tables.whole_mean([values.get(x) for x in column.labels]) for values in of_method]
-            cells += row.published.get(column.title, ["-"] * count) if column.complete else []
+            cells += published.get(column.title, ["-"] * count) if column.complete else []
         rows.append(tuple(cells))
     note = "Capped at 80 m for KITTI and 10 m for Booster. † in metres as they come out."
     note += f" Not run here: {', '.join(dict.fromkeys(empty))}." if empty else ""
@@ -170,7 +172,8 @@ def layout_table(
 def methods_of(name: str, added: Sequence[str]) -> tuple[str, ...]:
     """Every method that a table runs: the paper's rows, others beside them, and what the user adds."""
     layout, changed = LAYOUTS[name], ABLATED if name == "ablation" else ()
-    names = [*(row.method for row in layout.rows if not row.outside), *layout.methods, *added]
+    printed = (method for _, _, method, _ in layout.rows if not _is_outside(method))
+    names = [*printed, *layout.methods, *added]
     return tuple(dict.fromkeys([*names, *(method for preset in changed for _, method in CHANGES[preset])]))
 
 

@@ -58,17 +58,8 @@ class CaptureFrame:
     lens: Distortion | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class CaptureFiles:
-    """What a capture's files say: frames in order, ``unit`` ``"m"`` or ``None``, notes for the user."""
-
-    frames: tuple[CaptureFrame, ...]
-    kind: str
-    unit: str | None = "m"
-    notes: tuple[str, ...] = ()
-
-
-#: What a layout's reader finds: its kind, its unit, and the frames, each with its camera as the file has it.
+#: What a layout's reader returns: its kind, its unit (``"m"`` or ``None``), and the frames, each with its
+#: camera as the file has it.
 Found = tuple[str, str | None, Sequence[tuple[CaptureFrame, Camera | None]]]
 
 
@@ -78,8 +69,8 @@ def read_capture(
     K: np.ndarray | None = None,
     fov: float | None = None,
     trajectory: PathLike | None = None,
-) -> CaptureFiles:
-    """Read the frames of a capture, whatever its layout (docs/how-to/captures.md).
+) -> tuple[list[CaptureFrame], str, str | None, list[str]]:
+    """The frames of a capture in order, the kind of its layout, its unit, and notes for the user.
 
     ``K`` and ``fov`` (horizontal, degrees) are for layouts without intrinsics, and go before the files'.
     ``trajectory`` has a video's lines ``seconds tx ty tz qx qy qz qw``, camera-to-world, OpenCV's axes.
@@ -117,7 +108,7 @@ def read_capture(
     if len(frames) < 2:
         cure = "One frame has no second view: use geodiff depth with known points, or record more."
         bad_value("a capture", "at least two frames", f"{len(frames)} in {source}", cure)
-    return CaptureFiles(tuple(frames), kind, unit if tracked else None, tuple(notes))
+    return frames, kind, unit if tracked else None, notes
 
 
 def _finished(

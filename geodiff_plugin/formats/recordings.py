@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -94,11 +94,8 @@ def both_halves(image_01: np.ndarray, name: str = "video") -> tuple[np.ndarray, 
     return left, right
 
 
-class Stamp(NamedTuple):
-    """Nanoseconds of a message: by its header, and when it was recorded."""
-
-    header: int
-    recorded: int
+#: Nanoseconds of a message: by its header, and when it was recorded.
+Stamp = tuple[int, int]
 
 
 def is_bag(path: Path) -> bool:
@@ -139,7 +136,7 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
         with _open_bag(path) as reader:
             for topic in topics:
                 messages = reader.messages(_connections(reader, path, topic))
-                stamps.append(sorted(Stamp(_header_stamp(raw, reader.is2), at) for _, at, raw in messages))
+                stamps.append(sorted((_header_stamp(raw, reader.is2), at) for _, at, raw in messages))
     except InputError:
         raise
     except Exception as error:  # of any kind that a damaged bag leads to
@@ -148,8 +145,8 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
     pairs, free = [], stamps[1]
     for left in stamps[0]:
         at = bisect.bisect(free, left)
-        near = min(free[max(0, at - 1) : at + 1], key=lambda s: abs(s.header - left.header), default=None)
-        if near is not None and abs(near.header - left.header) <= 1e9 * tolerance_s:
+        near = min(free[max(0, at - 1) : at + 1], key=lambda s: abs(s[0] - left[0]), default=None)
+        if near is not None and abs(near[0] - left[0]) <= 1e9 * tolerance_s:
             pairs.append((left, near))
             free.remove(near)
     if not pairs:
@@ -178,10 +175,11 @@ class BagReader(AbstractContextManager["BagReader"]):
         return np.hstack(images)
 
     def _image(self, connections: list[Any], stamp: Stamp) -> np.ndarray:
-        for connection, _, raw in self._reader.messages(connections, stamp.recorded, stamp.recorded + 1):
-            if _header_stamp(raw, self._reader.is2) == stamp.header:
+        header, recorded = stamp
+        for connection, _, raw in self._reader.messages(connections, recorded, recorded + 1):
+            if _header_stamp(raw, self._reader.is2) == header:
                 return _decoded(self._reader.deserialize(raw, connection.msgtype), self._path)
-        raise InputFileError(f"the image of {stamp.header} ns in {self._path} does not read.")
+        raise InputFileError(f"the image of {header} ns in {self._path} does not read.")
 
 
 def _decoded(message: Any, path: Path) -> np.ndarray:
@@ -247,9 +245,9 @@ def write_depth_bag(
         writer: Any = rosbag2.Writer(made, **plugin) if is_ros2 else rosbag1.Writer(made)
         with writer:
             topics = [writer.add_connection(name, kind, typestore=store) for name, kind in kinds.items()]
-            for stamp, depth_m, K in frames:
+            for (stamped, recorded), depth_m, K in frames:
                 count += 1
-                time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp.header, 1_000_000_000))
+                time = store.types["builtin_interfaces/msg/Time"](*divmod(stamped, 1_000_000_000))
                 order = {} if is_ros2 else {"seq": 0}
                 header = store.types["std_msgs/msg/Header"](**order, stamp=time, frame_id=frame_id)
                 values = np.where(depth_m > 0, depth_m, np.nan).astype("<f4")
@@ -260,6 +258,6 @@ def write_depth_bag(
                 matrices = [m.astype(np.float64).ravel() for m in (np.zeros(5), K, np.eye(3), P)]
                 camera = camera_of(header, *size, "plumb_bob", *matrices, 0, 0, roi)
                 for topic, message in zip(topics, (image, camera), strict=True):
-                    writer.write(topic, stamp.recorded, serialize(message, message.__msgtype__))
+                    writer.write(topic, recorded, serialize(message, message.__msgtype__))
         os.replace(made / "depth.mcap" if is_ros2 else made, path)
     return count

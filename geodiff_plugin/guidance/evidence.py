@@ -184,7 +184,7 @@ def estimate_rig(
     tracks, poses = estimate_poses(views)
     Ts, spread = np.stack([pose.T for pose in poses]), None
     if not all(pose.rectified for pose in poses):
-        depth_m = coarse_depth(images[0], posed(Ts), K_left, views.left.shape)
+        depth_m = coarse_depth(images[0], posed(Ts), K_left, views[0][0].shape)
         Ts, tracks = polished(views, Ts, depth_m, tracks.seen_anywhere())
         spread = depth_spread(tracks, Ts)
     factor = tracks.K_left[0, 0] / Ks[0][0, 0]

@@ -41,14 +41,8 @@ DISAGREES = 0.1
 CONVENTION_GAIN = 0.5
 #: Names that a sentence gives.
 MOST_NAMES = 5
-
-
-@dataclass(frozen=True, eq=False)
-class Observations:
-    """Where one frame sees points of the solve: ``px (n, 2)`` of the frame, rows ``point (n,)`` of them."""
-
-    px: np.ndarray
-    point: np.ndarray
+#: Where one frame sees points of the solve, ``(n, 2)`` pixels, and the rows ``(n,)`` of these points.
+Observations = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,8 +325,8 @@ def _result(
         image = model.image(i + 1) if model.exists_image(i + 1) else None
         pairs = [(p.xy, rows[p.point3D_id]) for p in image.points2D if p.has_point3D()] if image else []
         px = np.array([xy for xy, _ in pairs]).reshape(-1, 2)
-        seen.append(Observations(base.pixels(i, px), np.array([row for _, row in pairs], int)))
-    enough = np.array([len(s.point) >= FEWEST_OBSERVATIONS for s in seen])
+        seen.append((base.pixels(i, px), np.array([row for _, row in pairs], int)))
+    enough = np.array([len(points) >= FEWEST_OBSERVATIONS for _, points in seen])
     return SolvedCapture(
         status,
         E,

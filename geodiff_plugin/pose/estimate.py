@@ -15,7 +15,7 @@ from torch import Tensor
 from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.pose.solve import FREE_PX, SCALE_PX, PosePrior, solve_poses
 from geodiff_plugin.pose.tracks import (
-    GreyViews,
+    GreyImage,
     Tracks,
     dense_tracks,
     merge_tracks,
@@ -111,11 +111,11 @@ def estimate_pose(tracks: Tracks, name: str = "the two photographs") -> Estimate
     return EstimatedPose(T, inliers, parallax, residual_px, sideways is not None, tuple(warnings))
 
 
-def estimate_poses(views: GreyViews) -> tuple[Tracks, list[EstimatedPose]]:
+def estimate_poses(views: Sequence[GreyImage]) -> tuple[Tracks, list[EstimatedPose]]:
     """The inliers of the right views of two photographs or more, and their poses; the first baseline is 1."""
     tracks, poses = sparse_tracks(views), []
-    for v in range(len(views.rights)):
-        name = "the two photographs" if len(views.rights) == 1 else f"the left and right photograph {v + 1}"
+    for v in range(len(views) - 1):
+        name = "the two photographs" if len(views) == 2 else f"the left and right photograph {v + 1}"
         poses.append(estimate_pose(tracks.view(v), name))
     seen = tracks.seen.copy()
     for v, pose in enumerate(poses):
@@ -220,7 +220,9 @@ def _rotation_residuals(tracks: Tracks) -> np.ndarray:
     return off
 
 
-def polished(views: GreyViews, Ts: np.ndarray, depth_m: Tensor, sparse: Tracks) -> tuple[np.ndarray, Tracks]:
+def polished(
+    views: Sequence[GreyImage], Ts: np.ndarray, depth_m: Tensor, sparse: Tracks
+) -> tuple[np.ndarray, Tracks]:
     """Estimated poses ``(V, 4, 4)`` of the ``sparse`` inliers, fitted once more to all matches of all views.
 
     ``depth_m`` is as for ``dense_tracks``. Returns poses, the first baseline unchanged, and all matches.

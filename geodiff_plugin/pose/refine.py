@@ -95,7 +95,7 @@ def refine_views(
         return tuple(rights), replace(report, status="mistaken", warnings=mistakes)
     if not misfit:
         return tuple(rights), replace(report, warnings=units)
-    depth_m = coarse_depth(left_01, _applied(rights, near), K_left, views.left.shape)
+    depth_m = coarse_depth(left_01, _applied(rights, near), K_left, views[0][0].shape)
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
     before = median_residuals(tracks, given)
     Ts, free = settle_poses(tracks, given, near, before, rig)
@@ -110,7 +110,7 @@ def refine_views(
         return tuple(rights), replace(report, status="kept", warnings=(*filter(None, far), *units))
     Ts, spread = (Ts, None) if rig or measured else _rescaled(tracks, given, Ts, before)
     bends = [
-        None if not before[v] > fits_px else fit_displacement(tracks.view(v), T, views.rights[v].shape)
+        None if not before[v] > fits_px else fit_displacement(tracks.view(v), T, views[v + 1][0].shape)
         for v, T in enumerate(Ts)
     ]
     pairs = zip(tracks.right_px, bends, strict=True)

@@ -38,6 +38,8 @@ FEWEST = 40
 #: Blocks a row of the left image, for what neighbouring residuals have in common.
 _BLOCKS, _FEWEST_IN_BLOCK, _FEWEST_BLOCKS = 10, 5, 3
 _TINY = 1e-12
+#: A grey image ``(H, W)`` uint8 and its K ``(3, 3)`` float64.
+GreyImage = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,18 +202,8 @@ def split_residuals(tracks: Tracks, T: np.ndarray) -> tuple[float, float]:
     return float(1.0 / max(inflated, 1.0)), float(max(common, 0.0) ** 0.5)
 
 
-@dataclass(frozen=True, eq=False)
-class GreyViews:
-    """Grey images ``(H, W)`` uint8 on the grid of the matches, all at about as many pixels per radian."""
-
-    left: np.ndarray
-    rights: tuple[np.ndarray, ...]
-    K_left: np.ndarray  # (3, 3) float64
-    K_rights: np.ndarray  # (V, 3, 3)
-
-
-def grey_image(image_01: Tensor, K_image: Tensor, factor: float) -> tuple[np.ndarray, np.ndarray]:
-    """A grey image shrunk by a factor <= 1, and its K."""
+def grey_image(image_01: Tensor, K_image: Tensor, factor: float) -> GreyImage:
+    """A grey image shrunk by a factor <= 1."""
     pixels = image_01.detach().cpu().float().permute(1, 2, 0).contiguous().numpy()
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if pixels.shape[-1] == 3 else pixels[..., 0]
     K = K_image.detach().cpu().double().numpy().copy()
@@ -225,14 +217,16 @@ def grey_image(image_01: Tensor, K_image: Tensor, factor: float) -> tuple[np.nda
     return np.rint(grey * 255.0).clip(0, 255).astype(np.uint8), K
 
 
-def grey_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> GreyViews:
-    """The images on the grid of the matches; ``left_01 (3, H, W)`` in [0, 1] has ``K_left (3, 3)``."""
-    left, K = grey_image(left_01, K_left, min(1.0, LONG_SIDE / max(left_01.shape[-2:])))
-    small = []
+def grey_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> list[GreyImage]:
+    """The images, left one first, at about as many pixels per radian: on the grid of the matches.
+
+    ``left_01 (3, H, W)`` in [0, 1] has ``K_left (3, 3)``.
+    """
+    views = [grey_image(left_01, K_left, min(1.0, LONG_SIDE / max(left_01.shape[-2:])))]
     for image, K_right, _ in rights:
-        as_fine = float(K[0, 0] / K_right[0, 0])
-        small.append(grey_image(image, K_right, min(1.0, as_fine, 2 * LONG_SIDE / max(image.shape[-2:]))))
-    return GreyViews(left, tuple(grey for grey, _ in small), K, np.stack([K_right for _, K_right in small]))
+        as_fine = float(views[0][1][0, 0] / K_right[0, 0])
+        views.append(grey_image(image, K_right, min(1.0, as_fine, 2 * LONG_SIDE / max(image.shape[-2:]))))
+    return views
 
 
 def sift_features(
@@ -266,16 +260,18 @@ def match_features(left: tuple[np.ndarray, np.ndarray], right: tuple[np.ndarray,
     return np.c_[rows[kept], best[kept]]
 
 
-def sparse_tracks(views: GreyViews) -> Tracks:
+def sparse_tracks(views: Sequence[GreyImage]) -> Tracks:
     """SIFT points of the left image with their matches in the right ones."""
-    left = sift_features(views.left)
-    right_px = np.zeros((len(views.rights), len(left[0]), 2))
+    (grey, K), *rights = views
+    left = sift_features(grey)
+    right_px = np.zeros((len(rights), len(left[0]), 2))
     seen = np.zeros(right_px.shape[:2], bool)
-    for v, image in enumerate(views.rights):
+    for v, (image, _) in enumerate(rights):
         right = sift_features(image)
         of_left, of_right = match_features(left, right).T
         right_px[v, of_left], seen[v, of_left] = right[0][of_right, :2], True
-    return Tracks(left[0][:, :2], right_px, seen, views.K_left, views.K_rights).seen_anywhere()
+    K_rights = np.stack([K_right for _, K_right in rights])
+    return Tracks(left[0][:, :2], right_px, seen, K, K_rights).seen_anywhere()
 
 
 def _flow(source: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -326,23 +322,23 @@ def coarse_depth(
     return F.interpolate(depth_m.detach().cpu().float(), size, mode="bilinear", align_corners=False)
 
 
-def dense_tracks(views: GreyViews, depth_m: Tensor, Ts: np.ndarray) -> Tracks:
+def dense_tracks(views: Sequence[GreyImage], depth_m: Tensor, Ts: np.ndarray) -> Tracks:
     """The centres of the left image's cells with their places by optical flow in the right images.
 
     ``depth_m (1, 1, H, W)`` is rough, on the left grid, without holes, and goes with the poses ``Ts
     (V, 4, 4)``, ``T_right_from_left``.
     """
-    size = views.left.shape
+    (left, K), *rights = views
+    size = left.shape
     rows, columns = (np.arange(_CELL_PX // 2, side, _CELL_PX) for side in size)
     centres = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
     right_px = np.zeros((len(Ts), len(centres), 2))
     seen = np.zeros((len(Ts), len(centres)), bool)
-    for v, (image, K, T) in enumerate(zip(views.rights, views.K_rights, Ts, strict=True)):
-        K_left, K_right, T_right = (
-            torch.as_tensor(m, dtype=torch.float32, device="cpu")[None] for m in (views.K_left, K, T)
-        )
-        rays = plane_rays(K_left, K_right, T_right, (size[0], size[1]))
+    for v, ((image, K_right), T) in enumerate(zip(rights, Ts, strict=True)):
+        K_l, K_r, T_r = (torch.as_tensor(m, dtype=torch.float32, device="cpu")[None] for m in (K, K_right, T))
+        rays = plane_rays(K_l, K_r, T_r, (size[0], size[1]))
         uv, z = (part[0].numpy() for part in project_rays(depth_m, rays))
         visible = (uv >= 0).all(-1) & (uv <= np.array(image.shape[::-1]) - 1).all(-1) & (z > 0)
-        right_px[v], seen[v] = _dense_matches(views.left, image, uv, visible, centres)
-    return Tracks(centres.astype(np.float64), right_px, seen, views.K_left, views.K_rights).seen_anywhere()
+        right_px[v], seen[v] = _dense_matches(left, image, uv, visible, centres)
+    K_rights = np.stack([K_right for _, K_right in rights])
+    return Tracks(centres.astype(np.float64), right_px, seen, K, K_rights).seen_anywhere()

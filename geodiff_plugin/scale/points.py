@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -111,7 +110,7 @@ def refine_to_matches(
     inverse = matches.inverse_depth.flatten()[at].clamp_min(0.0)
     confidence = matches.confidence.flatten()[at]
     doubt = ((1.0 - confidence) / _REFERENCE_DOUBT).clamp_min(_LEAST_DOUBT)
-    fitted = _Fitted(inverse, confidence, doubt.sqrt(), FIT_NOISE * matches.plane_step)
+    matched, noise = torch.stack([inverse, confidence, doubt.sqrt()]), FIT_NOISE * matches.plane_step
     values = _values_at(x, matches.size, at)
     form = SPACES[space]
     ends = _ends(form, near_m, far_m)
@@ -119,7 +118,7 @@ def refine_to_matches(
     upper = _ends(form, near_m * math.exp(NEAR_REACH), far_m * math.exp(FAR_REACH))
     bounds = torch.minimum(lower, upper), torch.maximum(lower, upper)
     for _ in range(FIT_ITERATIONS):
-        ends = _refine_once(form, ends, values, fitted, bounds)
+        ends = _refine_once(form, ends, values, matched, noise, bounds)
     at_zero, at_one = (form.forward(end, torch.ones_like(end)) for end in ends.unbind(1))
     return ordered(*form.ends(at_zero, at_one))
 
@@ -134,22 +133,15 @@ def ordered(near_m: Tensor, far_m: Tensor) -> tuple[Tensor, Tensor]:
     return torch.minimum(near_m, far_m * 0.98), far_m
 
 
-class _Fitted(NamedTuple):
-    """P matches, ``(P,)`` each: inverse depth >= 0, confidence, and standard deviation in units of ``noise``.
-
-    ``noise``, ``()``, is the standard deviation of a match of the reference confidence, 1/m.
-    """
-
-    inverse: Tensor
-    confidence: Tensor
-    deviation: Tensor
-    noise: Tensor
-
-
 def _refine_once(
-    form: Space, ends: Tensor, values: Tensor, fitted: _Fitted, bounds: tuple[Tensor, Tensor]
+    form: Space, ends: Tensor, values: Tensor, matched: Tensor, noise: Tensor, bounds: tuple[Tensor, Tensor]
 ) -> Tensor:
-    """One reweighted Gauss-Newton step on ``ends (B, 2)``, kept within ``bounds``."""
+    """One reweighted Gauss-Newton step on ``ends (B, 2)``, kept within ``bounds``.
+
+    ``matched (3, P)`` are the inverse depth >= 0 of matches, their confidence, and their standard deviation
+    in units of ``noise``, ``()`` 1/m, that of a match of the reference confidence.
+    """
+    inverse, confidence, deviation = matched
 
     def log_depth(v: Tensor) -> Tensor:
         return form.forward(v, torch.ones_like(v)).clamp_min(1e-9).log()
@@ -160,13 +152,13 @@ def _refine_once(
     # The relative noise is taken at the map's depth. At the match's depth, of two far matches with opposite
     # errors the nearer one would count for more.
     mapped = (-log_depth(v)).exp()
-    above = mapped + fitted.noise
-    residual = ((fitted.inverse + fitted.noise) / above).log().clamp(-1.0, 1.0)
+    above = mapped + noise
+    residual = ((inverse + noise) / above).log().clamp(-1.0, 1.0)
     slope = mapped / above * (log_depth(v + h) - log_depth(v - h)) / (2.0 * h)
-    left_over = 1.4826 * weighted_quantile(residual.abs(), fitted.confidence.expand_as(residual), 0.5)
+    left_over = 1.4826 * weighted_quantile(residual.abs(), confidence.expand_as(residual), 0.5)
     floor = left_over.clamp_min(FIT_FLOOR)[:, None]
-    variance = (fitted.deviation * fitted.noise / above) ** 2 + floor**2
-    weight = fitted.confidence / (variance * (1.0 + residual**2 / (FIT_CAUCHY**2 * variance)))
+    variance = (deviation * noise / above) ** 2 + floor**2
+    weight = confidence / (variance * (1.0 + residual**2 / (FIT_CAUCHY**2 * variance)))
     J = slope[..., None] * shares
     normal = torch.einsum("bpi,bp,bpj->bij", J, weight, J)
     gradient = torch.einsum("bpi,bp,bp->bi", J, weight, residual)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -31,28 +30,28 @@ KEEP_MARGIN = 2e-3
 IN_VIEW_RECTIFIED, IN_VIEW_POSED = 0.6, 0.25
 
 
-class Groups(NamedTuple):
-    """Pixels of a map, sorted by value, in ``K`` groups: a candidate is then tested by ``K`` lookups."""
+def group_pixels(x: Tensor, cost: Tensor, in_view: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Values ``x (P,)``, with ``cost`` and ``in_view (D, P)``, sorted and put into ``K`` groups of one size.
 
-    x: Tensor  # (K,) mean value
-    size: Tensor  # (K,) number of pixels
-    in_view: Tensor  # (D, K) how many of them a right view sees on each plane
-    cost: Tensor  # (D, K) sum of their clamped costs
-
-
-def group_pixels(x: Tensor, cost: Tensor, in_view: Tensor) -> Groups:
-    """Values ``x (P,)``, with their ``cost`` and ``in_view (D, P)``, in groups of one size."""
+    A candidate is then tested by ``K`` lookups. Returns the mean value and the number of pixels of every
+    group, ``(K,)``; on each plane how many of them a right view sees, and their clamped costs, ``(D, K)``.
+    """
     order, each = x.argsort(), -(-len(x) // GROUPS)
 
     def summed(values: Tensor) -> Tensor:
         return F.pad(values[..., order], (0, -len(x) % each)).unflatten(-1, (-1, each)).sum(-1)
 
     seen, size = in_view.to(cost), summed(torch.ones_like(x))
-    return Groups(summed(x) / size, size, summed(seen), summed(cost.clamp_max(COST_CLAMP) * seen))
+    return summed(x) / size, size, summed(seen), summed(cost.clamp_max(COST_CLAMP) * seen)
 
 
-def _lookup(groups: Groups, inverse_depth: Tensor, depth_m: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean clamped cost and share in view ``(M,)`` of candidate depths ``(M, K)``, linear between planes."""
+def _lookup(
+    size: Tensor, in_view: Tensor, cost: Tensor, inverse_depth: Tensor, depth_m: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Mean clamped cost and share in view ``(M,)`` of candidate depths ``(M, K)``, linear between planes.
+
+    ``size (K,)``, ``in_view`` and ``cost (D, K)`` are those of ``group_pixels``.
+    """
     planes = inverse_depth.shape[0]
     step = (inverse_depth[-1] - inverse_depth[0]) / (planes - 1)
     position = (1.0 / depth_m - inverse_depth[0]) / step
@@ -66,9 +65,9 @@ def _lookup(groups: Groups, inverse_depth: Tensor, depth_m: Tensor) -> tuple[Ten
         return torch.lerp(table.gather(0, below), table.gather(0, below + 1), weight)
 
     # Beyond the nearest plane the cost is unknown: it counts as an outlier, not as out of view.
-    cost = torch.where(inside, between(groups.cost), COST_CLAMP * groups.size).sum(1)
-    count = torch.where(inside, between(groups.in_view), groups.size).sum(1)
-    return cost / count.clamp_min(1.0), count / groups.size.sum()
+    summed = torch.where(inside, between(cost), COST_CLAMP * size).sum(1)
+    count = torch.where(inside, between(in_view), size).sum(1)
+    return summed / count.clamp_min(1.0), count / size.sum()
 
 
 @torch.no_grad()
@@ -108,10 +107,13 @@ def search_scale(
     least = IN_VIEW_RECTIFIED if volume.rectified else IN_VIEW_POSED
     values = F.interpolate(x.float(), (height, width), mode="bilinear", align_corners=False).flatten(1)[:, at]
 
-    def best_of(groups: Groups, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def best_of(
+        groups: tuple[Tensor, Tensor, Tensor, Tensor], near: Tensor, far: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """The best of candidate ends ``(M,)`` for the values of one map, and its cost, ``(1,)`` each."""
-        depth = SPACES[space].depth_at(groups.x[None], near[:, None], far[:, None])
-        mean, share = _lookup(groups, volume.inverse_depth, depth)
+        mean_x, size, seen, costs = groups
+        depth = SPACES[space].depth_at(mean_x[None], near[:, None], far[:, None])
+        mean, share = _lookup(size, seen, costs, volume.inverse_depth, depth)
         mean = mean + (share < least) * 1.0  # so one of these wins only if no pair keeps enough in view
         k = mean.argmin(keepdim=True)  # a 0-d index would be read back from the device
         return near[k], far[k], mean[k]

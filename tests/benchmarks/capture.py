@@ -73,7 +73,7 @@ def main(argv: list[str] | None = None) -> None:
         rows=tuple(given.rows.split(",")),
         out=given.out,
     )
-    print(COMMANDS["capture"]("capture", options).markdown())
+    print(COMMANDS["capture"].run(options).markdown())
 
 
 if __name__ == "__main__":

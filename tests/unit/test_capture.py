@@ -64,10 +64,10 @@ def turn_error_deg(E: np.ndarray) -> float:
 def depth_ratios(found: SolvedCapture) -> np.ndarray:
     """Depth of the points over the truth, median of every frame."""
     medians = []
-    for seen, E, truth in zip(found.seen, found.E, TRUE, strict=True):
+    for (px, seen), E, truth in zip(found.seen, found.E, TRUE, strict=True):
         T = np.linalg.inv(E)
-        z = found.points[seen.point] @ T[2, :3] + T[2, 3]
-        u, v = np.rint(seen.px).astype(int).T
+        z = found.points[seen] @ T[2, :3] + T[2, 3]
+        u, v = np.rint(px).astype(int).T
         medians.append(np.median(z / render(truth)[1][v, u]))
     return np.array(medians)
 
@@ -220,14 +220,14 @@ def test_eval_capture_measures_every_row(tmp_path, monkeypatch):
     capture, rows, out = Capture.open(data), ("given", "capture"), tmp_path / "out"
     assert [capture.solve(way).status for way in ("given", None, "refined")] == ["given", "given", "solved"]
     options = CaptureEvalOptions(data=(data,), count=4, neighbours=(2,), rows=rows, out=out, quiet=True)
-    (table,) = COMMANDS["capture"]("capture", options).tables
+    (table,) = COMMANDS["capture"].run(options).tables
     assert table.title == "scan, 4 frames" and [row[1] for row in table.rows] == ["3", "3", "all"]
     assert [float(row[2]) for row in table.rows[:2]] == pytest.approx([0.1, 0.02], abs=2e-4)
     assert float(table.rows[2][2]) < 0.05
     assert "| solved over the capture" in (out / "capture.md").read_text()
     again = replace(options, rows=("capture",))  # from the journal
     monkeypatch.setattr(Capture, "depth", lambda *_, **__: pytest.fail("measured before"))
-    assert COMMANDS["capture"]("capture", again).tables[0].rows == table.rows[1:]
+    assert COMMANDS["capture"].run(again).tables[0].rows == table.rows[1:]
 
 
 HALVED = TRUE.copy()

@@ -10,8 +10,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import InputError
+from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.formats import read_calibration
-from geodiff_plugin.formats.captures import read_capture
 from geodiff_plugin.formats.clouds import Cloud
 from geodiff_plugin.formats.sfm import write_colmap
 from tests.unit.capture_room import SIZE, K, render, walk, write_transforms
@@ -88,15 +88,15 @@ LAYOUTS = [transforms, colmap_text, colmap_binary, seven_scenes, scannet, tum]
 
 @pytest.mark.parametrize("write", LAYOUTS, ids=lambda write: write.__name__)
 def test_every_layout_gives_the_same_frames(write, tmp_path):
-    files = read_capture(write(tmp_path / "scan"))
-    assert len(files.frames) == 4 and not files.notes
-    for frame, E in zip(files.frames, TRUE, strict=True):
+    capture = Capture.open(write(tmp_path / "scan"))
+    assert len(capture.frames) == 4 and not capture.notes
+    for frame, E in zip(capture.frames, TRUE, strict=True):
         np.testing.assert_allclose(frame.E, E, atol=1e-6)
         np.testing.assert_allclose(frame.K, K, atol=1e-9)
         assert frame.size == SIZE and frame.lens is None and frame.image.is_file()
-    assert files.unit == (None if "colmap" in write.__name__ else "m")
-    assert (files.frames[3].depth is not None) == (write in (transforms, scannet, tum))
-    points = [None if frame.points is None else frame.points.tolist() for frame in files.frames]
+    assert capture.unit == (None if "colmap" in write.__name__ else "m")
+    assert (capture.frames[3].depth is not None) == (write in (transforms, scannet, tum))
+    points = [None if frame.points is None else frame.points.tolist() for frame in capture.frames]
     seen = [[0.5, 0.25, 2.6]] if "colmap" in write.__name__ else None
     assert points == [seen, seen, None, seen]
 
@@ -108,7 +108,7 @@ def test_binary_models_are_calibrations_and_a_cut_off_file_is_named(tmp_path, na
     np.testing.assert_allclose(rig.K_right, K)
     path.write_bytes(path.read_bytes()[:-3])
     with pytest.raises(InputError, match=rf"{name} must be a binary COLMAP file; got less.*cut off"):
-        read_capture(tmp_path)
+        Capture.open(tmp_path)
 
 
 def test_a_video_takes_its_poses_from_a_trajectory(tmp_path):
@@ -118,30 +118,30 @@ def test_a_video_takes_its_poses_from_a_trajectory(tmp_path):
     writer.release()
     (tmp_path / "t.txt").write_text(trajectory(TRUE[:3], np.arange(3) / 10))
     np.savetxt(tmp_path / "K.txt", K)
-    files = read_capture(tmp_path / "v.mp4", K=K, trajectory=tmp_path / "t.txt")
-    assert [frame.index for frame in files.frames] == [0, 1, 2] and "000003" in files.notes[0]
-    np.testing.assert_allclose([frame.E for frame in files.frames], TRUE[:3], atol=1e-6)
+    capture = Capture.open(tmp_path / "v.mp4", K=K, trajectory=tmp_path / "t.txt")
+    assert [frame.index for frame in capture.frames] == [0, 1, 2] and "000003" in capture.notes[0]
+    np.testing.assert_allclose([frame.E for frame in capture.frames], TRUE[:3], atol=1e-6)
     with pytest.raises(InputError, match="--fov"):
-        read_capture(tmp_path / "v.mp4")
+        Capture.open(tmp_path / "v.mp4")
 
 
 def test_images_without_poses_take_a_field_of_view(tmp_path):
     for i, image in enumerate(IMAGES):
         save(tmp_path / f"i{i}.png", image)
-    files = read_capture(tmp_path, fov=60.0)
-    assert all(frame.E is None for frame in files.frames) and files.unit is None
-    np.testing.assert_allclose(files.frames[0].K[0, 0], 120 / np.tan(np.radians(30)))
+    capture = Capture.open(tmp_path, fov=60.0)
+    assert all(frame.E is None for frame in capture.frames) and capture.unit is None
+    np.testing.assert_allclose(capture.frames[0].K[0, 0], 120 / np.tan(np.radians(30)))
     with pytest.raises(InputError, match="K"):
-        read_capture(tmp_path)
+        Capture.open(tmp_path)
 
 
 def test_units_and_lenses_of_transforms(tmp_path):
     folder = write_transforms(tmp_path, TRUE, TRUE, k1=-0.1)
     path = folder / "transforms.json"
     path.write_text(path.read_text().replace('"transform_matrix"', '"colmap_im_id": 1, "transform_matrix"'))
-    files = read_capture(folder)
-    assert files.unit is None and files.frames[0].lens.coefficients[0] == -0.1
-    assert files.frames[0].depth == folder / "depth/f00.png"
+    capture = Capture.open(folder)
+    assert capture.unit is None and capture.frames[0].lens.coefficients[0] == -0.1
+    assert capture.frames[0].depth == folder / "depth/f00.png"
 
 
 def crop(folder: Path, data: dict) -> None:
@@ -170,20 +170,20 @@ def test_bad_captures_get_a_sentence(change, words, tmp_path):
     change(folder, data)
     (folder / "transforms.json").write_text(json.dumps(data))
     with pytest.raises(InputError, match=words):
-        read_capture(folder)
+        Capture.open(folder)
 
 
 def test_missing_images_and_lost_poses_are_named(tmp_path):
     folder = write_transforms(tmp_path / "a", TRUE, TRUE)
     (folder / "images/f01.png").unlink()
-    files = read_capture(folder)
-    assert len(files.frames) == 3 and "f01" in files.notes[0]
+    capture = Capture.open(folder)
+    assert len(capture.frames) == 3 and "f01" in capture.notes[0]
     lost = seven_scenes(tmp_path / "b")
     (lost / "frame-000002.pose.txt").write_text("-inf " * 16)
-    files = read_capture(lost)
-    assert len(files.frames) == 3 and "frame-000002" in files.notes[0]
+    capture = Capture.open(lost)
+    assert len(capture.frames) == 3 and "frame-000002" in capture.notes[0]
     with pytest.raises(FileNotFoundError):
-        read_capture(tmp_path / "nowhere")
+        Capture.open(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="none of these"):
-        read_capture(tmp_path / "empty")
+        Capture.open(tmp_path / "empty")

@@ -19,7 +19,6 @@ from geodiff_plugin.config import (
     SEARCH_ONLY,
     SECTIONS,
     GuidanceConfig,
-    Knob,
     config_from_text,
     knob_lines,
     sentences,
@@ -32,10 +31,10 @@ from geodiff_plugin.config import (
 
 @pytest.mark.parametrize("described", dataclasses.fields(GuidanceConfig), ids=lambda field: field.name)
 def test_the_default_of_every_knob_is_legal(described):
-    knob = Knob.of(described)
-    assert "|" not in knob.values
-    assert knob.check(described.default, described.name) == described.default
-    assert bool(knob.unset) == (described.default is None)
+    knob = described.metadata
+    assert "|" not in knob["values"]
+    assert knob["check"](described.default, described.name) == described.default
+    assert bool(knob["unset"]) == (described.default is None)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -118,14 +117,14 @@ def tables():
     """Markdown tables of every knob, a section each."""
     lines, said = [], sentences()
     for described in dataclasses.fields(GuidanceConfig):
-        name, knob = described.name, Knob.of(described)
+        name, knob = described.name, described.metadata
         if name in SECTIONS:
             lines += ["", f"### {SECTIONS[name]}", ""]
             lines += ["| knob | default | what it does; range |", "| --- | --- | --- |"]
-        default = f"`None`: {knob.unset}" if knob.unset else shown(described.default)
-        paper = knob.paper.format(shown(value_of(name, PAPER)))
+        default = f"`None`: {knob['unset']}" if knob["unset"] else shown(described.default)
+        paper = knob["paper"].format(shown(value_of(name, PAPER)))
         default += f" (paper: {paper})" if paper not in ("-", shown(described.default)) else ""
-        values = "" if knob.values == "bool" else f"; {knob.values}"
+        values = "" if knob["values"] == "bool" else f"; {knob['values']}"
         lines.append(f"| `{name}` | {default} | {said[name]}{values} |")
     return "\n".join([*lines, ""])
 
