@@ -33,7 +33,7 @@ BROAD_SMOOTHNESS, BROAD_INERTIA = 50.0, 1e-4
 #: Smoothness, and inertia as a share of it, of the fit that measures the prior and finds outliers.
 STIFF_SMOOTHNESS, STIFF_INERTIA = 400.0, 1.3e-3
 #: Robustly reweighted solves, and conjugate-gradient steps of each on every level of its pyramid.
-REWEIGHTINGS, SOLVER_STEPS = 2, 8
+REWEIGHTINGS, SOLVER_STEPS = 2, 6
 #: Residual, in standard deviations of a match, from which it counts for less.
 RESIDUAL_CAUCHY = 2.5
 #: Side of the blocks of matches left out to measure the prior, in image sides.

@@ -42,8 +42,8 @@ SLOPE = 0.04
 RAMP_BRIGHTNESS = 0.12
 #: Two opposite neighbours: across, down, and both diagonals.
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
-#: Pixels on ramps whose windows are in memory at once; pixels per strip of the votes, for a CPU's cache.
-CHUNK, STRIP = 1 << 16, 1 << 13
+#: Pixels whose windows are worked on at once: more do not fit into a CPU's cache.
+STRIP = 1 << 13
 #: Upper bound on the pixels of the voting grid; larger pictures upsample its depth, guided by colour.
 MOST_PIXELS = 600_000
 #: Offsets of the voters in samples (every second one of the window); pixels between samples.
@@ -93,7 +93,7 @@ def sharpen_edges(depth_m: Tensor, left_01: Tensor, spacing: int = 1) -> Tensor:
             strip = _Strip(depth[0], image, spacing)
             v, u = strip.on_ramp().nonzero(as_tuple=True)
             target = out[index, 0, rows]
-            for at in zip(v.split(CHUNK), u.split(CHUNK), strict=True):
+            for at in zip(v.split(STRIP), u.split(STRIP), strict=True):
                 target[at] = strip.median(*at).to(target)
     return out
 

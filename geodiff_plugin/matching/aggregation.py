@@ -39,11 +39,11 @@ class Buffers:
         return held[:count].view(size[0], planes, size[1]).transpose(0, 1)
 
 
-def _scan_rows(cost: Tensor, p1: int, p2: Tensor, total: Tensor) -> None:
+def _scan_rows(cost: Tensor, p1: int, p2: Tensor, total: Tensor, fresh: bool) -> None:
     """Add the path from the first row down and that from the last row up to ``total (D, N, M)`` int16.
 
     ``cost (D, N, M)`` uint8; ``p1`` is the penalty of a step of one plane, ``p2 (N, M)`` int16 that of any
-    larger one between row n - 1 and row n.
+    larger one between row n - 1 and row n. A ``fresh`` total has no content yet.
     """
     planes, count, breadth = cost.shape
     # Both directions advance together, entry 0 down and entry 1 up; the padding at both ends never wins.
@@ -59,11 +59,13 @@ def _scan_rows(cost: Tensor, p1: int, p2: Tensor, total: Tensor) -> None:
             torch.minimum(step, path, out=step)
             torch.minimum(step, limits[n - 1] + least, out=step).sub_(least)
         for i, row in enumerate(rows):
-            if n:
-                torch.add(step[i], cost[:, row], out=path[i])
-            else:
-                path[i] = cost[:, row]
-            total[:, row] += path[i]
+            if fresh and 2 * n < count:
+                total[:, row].zero_()
+            path[i].copy_(cost[:, row])  # a sum of two types would cost more
+        if n:
+            path.add_(step)
+        for i, row in enumerate(rows):
+            total[:, row].add_(path[i])
 
 
 def _limits(grey: Tensor) -> tuple[Tensor, Tensor]:
@@ -97,8 +99,8 @@ def aggregate(levels: Tensor, grey: Tensor, *, buffers: Buffers | None = None) -
     # Contiguous copies plane by plane make the transposition several times as fast.
     for plane, source in zip(turned, levels, strict=True):
         plane.copy_(source.contiguous().T.contiguous())
-    _scan_rows(turned, step, horizontal, sideways.zero_())
+    _scan_rows(turned, step, horizontal, sideways, True)
     for plane, source in zip(total, sideways, strict=True):
         plane.copy_(source.contiguous().T.contiguous())
-    _scan_rows(levels, step, vertical, total)
+    _scan_rows(levels, step, vertical, total, False)
     return total

@@ -253,7 +253,7 @@ def match_features(left: tuple[np.ndarray, np.ndarray], right: tuple[np.ndarray,
     rows = np.arange(len(alike))
     best = alike.argmax(1)
     nearest = alike[rows, best]
-    mutual = alike.argmax(0)[best] == rows
+    mutual = alike.max(0)[best] == nearest  # several times as fast as argmax along columns
     alike[rows, best] = -1.0
     second = alike.max(1)
     kept = mutual & ((1.0 - nearest) < _RATIO**2 * (1.0 - second))

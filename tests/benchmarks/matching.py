@@ -89,8 +89,13 @@ def data_pairs(root: str, device: str = "cpu") -> Iterator[tuple[str, Pair]]:
 
 
 def least_seconds(work: Callable[[], object], device: str, repeats: int) -> tuple[float, float]:
-    """Least CPU seconds and least seconds of a clock of several runs, after one to warm up."""
+    """Least CPU seconds and least seconds of a clock of several runs, after one to warm up.
+
+    OpenCV has as many threads as torch.
+    """
     cpu = clock = math.inf
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(torch.get_num_threads())
     for turn in range(repeats + 1):
         cpu_start, start = time.process_time(), time.perf_counter()
         work()
@@ -99,6 +104,7 @@ def least_seconds(work: Callable[[], object], device: str, repeats: int) -> tupl
         if turn:
             cpu = min(cpu, time.process_time() - cpu_start)
             clock = min(clock, time.perf_counter() - start)
+    cv2.setNumThreads(threads)
     return cpu, clock
 
 
@@ -145,7 +151,7 @@ def disparities_of(volume: CostVolume, width: int) -> int:
 
 
 def sgbm_call(pair: Pair, disparities: int) -> Callable[[], object]:
-    """OpenCV's ``StereoSGBM`` with eight paths on the same images, as many threads as torch has.
+    """OpenCV's ``StereoSGBM`` with eight paths on the same images.
 
     Args:
         pair: its images may differ in size.
@@ -162,14 +168,7 @@ def sgbm_call(pair: Pair, disparities: int) -> Callable[[], object]:
     checks = {"disp12MaxDiff": 1, "uniquenessRatio": 10, "speckleWindowSize": 100, "speckleRange": 2}
     matcher = cv2.StereoSGBM_create(0, disparities, 5, mode=cv2.STEREO_SGBM_MODE_HH, **penalties, **checks)
 
-    def compute() -> object:
-        threads = cv2.getNumThreads()
-        cv2.setNumThreads(torch.get_num_threads())
-        found = matcher.compute(left, right)
-        cv2.setNumThreads(threads)
-        return found
-
-    return compute
+    return lambda: matcher.compute(left, right)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -244,7 +244,7 @@ def test_sharpening_gives_depths_that_are_there_whatever_the_strips(monkeypatch)
     whole = sharpen_edges(soft, left, 2)
     assert not torch.equal(whole, soft) and torch.isin(whole, soft).all()
     monkeypatch.setattr("geodiff_plugin.formats.depth.STRIP_PIXELS", 5 * 64)
-    monkeypatch.setattr(finish, "CHUNK", 7)
+    monkeypatch.setattr(finish, "STRIP", 7)
     assert torch.equal(sharpen_edges(soft, left, 2), whole)
 
 
