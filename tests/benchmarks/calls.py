@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         pairs = data_pairs(options.data, options.device)
     title = f"CPU seconds (seconds of a clock) on {options.device}"
     table = Table("pair", "size", "threads", "plain", "guided", "SGBM", "guided / SGBM", title=title)
-    before = torch.get_num_threads()
+    before, total = torch.get_num_threads(), dict.fromkeys(options.threads, (0.0, 0.0))
     for name, pair in pairs:
         for threads in options.threads:
             torch.set_num_threads(threads)
@@ -78,8 +78,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 for key, work in calls_of(pair, pipe, options.knobs).items()
             }
             shown = [f"{seconds[k][0]:.2f} ({seconds[k][1]:.2f})" for k in ("plain", "guided", "SGBM")]
-            ratio = f"{seconds['guided'][0] / seconds['SGBM'][0]:.1f}"
-            table.add_row(name, f"{pair[0].shape[-1]}x{pair[0].shape[-2]}", f"{threads}", *shown, ratio)
+            guided, sgbm = (seconds[k][0] for k in ("guided", "SGBM"))
+            size = f"{pair[0].shape[-1]}x{pair[0].shape[-2]}"
+            table.add_row(name, size, f"{threads}", *shown, f"{guided / sgbm:.1f}")
+            total[threads] = total[threads][0] + guided, total[threads][1] + sgbm
+    for threads, (guided, sgbm) in total.items():
+        table.add_row("all", "", f"{threads}", "", f"{guided:.2f}", f"{sgbm:.2f}", f"{guided / sgbm:.1f}")
     torch.set_num_threads(before)
     Console(width=max(Console().width, 120)).print(table)
 
