@@ -134,13 +134,16 @@ def refined_scale(refined: np.ndarray, given: np.ndarray, misfit: float) -> tupl
     errors of rotation and shift compensate. The result is their mean, weighted by uncertainty. ``refined``
     and ``given (N,)`` are inverse depths under the refined poses, with the given lengths, and under the given
     poses. ``misfit`` is the median distance of matches from their epipolar lines over their median parallax:
-    as much error is expected along the lines, where it changes depth.
+    as much error is expected along the lines, where it changes depth. The more the ratio of both depths
+    differs from place to place, the less its median says about the scale.
     """
     ahead = (refined > 0) & (given > 0)
     if not ahead.any():
         return float("nan"), float("nan")
-    by_depth = float(np.median(np.log(refined[ahead] / given[ahead])))
-    of_length, of_depth = LENGTH_SPREAD**2, DEPTH_SPREAD**2 + misfit**2
+    ratios = np.log(refined[ahead] / given[ahead])
+    by_depth = float(np.median(ratios))
+    uneven = float(np.median(np.abs(ratios - by_depth)))
+    of_length, of_depth = LENGTH_SPREAD**2, DEPTH_SPREAD**2 + misfit**2 + uneven**2
     weight = of_length / (of_length + of_depth)
     # The variance of the weighted mean, and what the two lengths disagree by.
     variance = weight * of_depth + weight * (1.0 - weight) * by_depth**2
