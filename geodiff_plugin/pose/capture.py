@@ -39,6 +39,9 @@ SCALE_FLOOR_TRAJECTORY, SCALE_FLOOR_DEPTH = 0.02, 0.015
 DISAGREES = 0.1
 #: Another convention of the given poses is taken where it leaves this share of their misfit at most.
 CONVENTION_GAIN = 0.5
+#: A given position is named as wrong if it moved so many times as far as the median one, and by this share of
+#: the size of the whole trajectory.
+FAR_TIMES, FAR_SHARE = 10.0, 0.1
 #: Names that a sentence gives.
 MOST_NAMES = 5
 #: Where one frame sees points of the solve, ``(n, 2)`` pixels, and the rows ``(n,)`` of these points.
@@ -349,6 +352,14 @@ def _noted(result: SolvedCapture, notes: list[str], names: Sequence[str]) -> Sol
         )
     if spread > DISAGREES:
         notes.append(f"The scale is uncertain by {100 * spread:.0f} %: give --known-length for an exact one.")
+    if result.status == "solved" and result.E_given is not None:
+        moved, size = result.moved()[0], np.linalg.norm(np.ptp(result.E_given[:, :3, 3], axis=0))
+        least = max(FAR_TIMES * float(np.nanmedian(moved)), FAR_SHARE * float(size))
+        if wrong := [name for name, by in zip(names, moved, strict=True) if by > least]:
+            notes.append(
+                f"The given poses of {_some_names(wrong)} are far from where the pictures put these frames, "
+                "and are not used."
+            )
     lost = [name for name, connected in zip(names, result.connected, strict=True) if not connected]
     if lost and result.status != "given":
         kept = "have no pose and are skipped" if result.E_given is None else "keep their poses as given"

@@ -104,13 +104,16 @@ def test_other_conventions_are_found_by_the_residuals(form, name):
     assert turn_error_deg(found.E) < 0.5
 
 
-def test_a_blurred_frame_keeps_its_pose_and_is_named():
+def test_a_blurred_frame_keeps_its_pose_and_is_named_as_is_a_wrong_pose():
     images = [grey(E) for E in TRUE]
     images[4] = cv2.blur(images[4], (61, 61))
-    found = solve(GIVEN, images, names=[f"f{i}" for i in range(COUNT)])
+    given = GIVEN.copy()
+    given[7, 1, 3] += 1.0
+    found = solve(given, images, names=[f"f{i}" for i in range(COUNT)])
     assert not found.connected[4] and found.connected.sum() == COUNT - 1
     assert any("1 of 10 frames" in note and "f4" in note for note in found.notes)
     assert any("f4: blurred" in note for note in found.notes)
+    assert any("poses of f7 are far" in note for note in found.notes)
     np.testing.assert_allclose(found.pose(4, 5), np.linalg.inv(GIVEN[4]) @ GIVEN[5], atol=1e-9)
     assert all(4 not in choose_neighbours(found, frame, 4) for frame in (3, 5))
 
