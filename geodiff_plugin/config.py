@@ -46,11 +46,13 @@ def _knob(
     ``values`` are its range in words; ``check`` gives the value as it is kept; ``paper`` is what the paper
     says of it, with ``"{}"`` for the value of ``PAPER``; ``unset`` what ``None`` becomes, empty for no value.
     """
-    checked: Callable[[Any, str], Any] = lambda v, name: None if unset and v is None else check(v, name)  # noqa: E731
+
+    def checked(value: Any, name: str) -> Any:
+        return None if unset and value is None else check(value, name)
+
     values += ", or `None`" if unset else ""
-    return field(
-        default=default, metadata={"values": values, "check": checked, "paper": paper, "unset": unset}
-    )
+    metadata = {"values": values, "check": checked, "paper": paper, "unset": unset}
+    return field(default=default, metadata=metadata)
 
 
 def _number(default: float | None, low: float, high: float, kind: type = float, **more: str) -> Any:
