@@ -232,9 +232,9 @@ def check_files(options: DepthOptions, photographs: bool = True) -> None:
         for name, path in views.items():
             with open_image(path, name):  # the head alone; the rest when it is read
                 pass
-        for (one, a), (other, b) in itertools.combinations(views.items(), 2):
+        for (first, a), (second, b) in itertools.combinations(views.items(), 2):
             if a.samefile(b):
-                bad_value(other, f"another photograph than {one}", f"{b} for both")
+                bad_value(second, f"another photograph than {first}", f"{b} for both")
     for name, path in options.other_files():
         model = any(os.path.exists(path / file) for file in (*MODEL_FILES, "images.bin"))
         if not (name == "calibration" and model):  # missing files of a model are reported when it is read

@@ -61,10 +61,10 @@ def _finish(
     return fitted_m, support
 
 
-def _finish_images(run: GuidedRun, depth_m: Tensor, lefts: Tensor) -> tuple[Tensor, Tensor | None]:
+def _finish_images(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor) -> tuple[Tensor, Tensor | None]:
     """Refined maps ``(N, 1, H, W)`` and their support; maps unchanged, and ``None``, if one has no target."""
     results = []
-    for i, (depth, left) in enumerate(zip(depth_m.split(1), lefts.split(1), strict=True)):
+    for i, (depth, left) in enumerate(zip(depth_m.split(1), lefts_01.split(1), strict=True)):
         result = _finish(run, i, depth, left) if run.config.crisp else None
         if result is None:
             return depth_m, None
@@ -73,7 +73,7 @@ def _finish_images(run: GuidedRun, depth_m: Tensor, lefts: Tensor) -> tuple[Tens
     return torch.cat(depths), torch.cat(supports)
 
 
-def _spread_of_members(run: GuidedRun, depth_m: Tensor, lefts: Tensor, call: Mapping[str, Any]) -> Tensor:
+def _spread_of_members(run: GuidedRun, depth_m: Tensor, lefts_01: Tensor, call: Mapping[str, Any]) -> Tensor:
     """Spread of the members of every ensemble, each refined, around its result: ``(N, 1, H, W)`` metres."""
     size, method = image_size(depth_m), call["resample_method_output"]
     reduction = (call["ensembling_kwargs"] or {}).get("reduction", "median")
@@ -83,7 +83,9 @@ def _spread_of_members(run: GuidedRun, depth_m: Tensor, lefts: Tensor, call: Map
         if image_size(members) != size:  # resized as the stock call resizes the ensemble
             members = MarigoldImageProcessor.resize_antialias(members, size, method, is_aa=False)
             members = run.within_range(members, i)
-        results = [_finish(run, i, member, lefts[i : i + 1], m) for m, member in enumerate(members.split(1))]
+        results = [
+            _finish(run, i, member, lefts_01[i : i + 1], m) for m, member in enumerate(members.split(1))
+        ]
         finished = torch.cat([result[0] for result in results if result is not None])
         spreads.append(_spread_around(depth_m[i : i + 1], finished, reduction))
     return torch.cat(spreads)
@@ -134,14 +136,14 @@ def assemble_output(
     count, size, has_unit = len(natives), image_size(lefts_01), guidance.unit is not None
     depth_m = run.within_range(stock.prediction.float().to(lefts_01.device))  # or the grid's size
     grid = image_size(depth_m)
-    lefts = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
-    depth_m, support = _finish_images(run, depth_m, lefts)
+    lefts_01 = lefts_01 if grid == size else F.interpolate(lefts_01, grid, mode="bilinear", antialias=True)
+    depth_m, support = _finish_images(run, depth_m, lefts_01)
     uncertainty = None if stock.uncertainty is None else stock.uncertainty.to(depth_m)
     if uncertainty is not None and support is not None:
-        uncertainty = _spread_of_members(run, depth_m, lefts, call)
+        uncertainty = _spread_of_members(run, depth_m, lefts_01, call)
     Ks = torch.stack([torch.as_tensor(i.K_left, device="cpu").float() for i in guidance.inputs]).to(depth_m)
     K = resize_intrinsics(Ks, size, grid)
-    visible, error = _reprojected(run, depth_m, lefts, K)
+    visible, error = _reprojected(run, depth_m, lefts_01, K)
     prior_error = run.prior_error()  # (N, 1, 1, 1), or per pixel: the measured error where valid
     confidence, over_prior = None, _over_prior(run, depth_m)
     if support is not None:
@@ -202,11 +204,11 @@ def assemble_output(
 
 
 def _reprojected(
-    run: GuidedRun, depth_m: Tensor, lefts: Tensor, K: Tensor
+    run: GuidedRun, depth_m: Tensor, lefts_01: Tensor, K: Tensor
 ) -> tuple[Tensor, Tensor] | tuple[None, None]:
     """Visibility and photometric error of every image, ``(N, 1, H, W)``; ``None`` without right views."""
     maps = [
-        reprojection(evidence.native_views, depth_m[i : i + 1], lefts[i : i + 1], K[i : i + 1])
+        reprojection(evidence.native_views, depth_m[i : i + 1], lefts_01[i : i + 1], K[i : i + 1])
         for i, evidence in enumerate(run.evidence)
         if evidence.native_views
     ]
