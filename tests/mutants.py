@@ -139,15 +139,15 @@ MUTANTS = [
         ("FIT_CAUCHY = 2.0", "FIT_CAUCHY = 4.0"),
         ("FIT_FLOOR = 0.5, 4e-3", "FIT_FLOOR = 1.0, 4e-3"),
         ("nearness = -values if", "nearness = values if"),
-        ("doubt.sqrt(), FIT_NOISE", "doubt, FIT_NOISE"),
+        ("confidence, doubt.sqrt()]", "confidence, doubt]"),
         ("NEAR_REACH, FAR_REACH = 1.4, 0.7", "NEAR_REACH, FAR_REACH = 0.7, 0.7"),
         ("share * below[:, -1:]", "0.5 * below[:, -1:]"),
     ),
     *of(
         "scale/volume_search.py",
         ("COST_CLAMP = 0.35", "COST_CLAMP = 0.4"),
-        ("COST_CLAMP * groups.size).sum(1)", "0.0 * groups.size).sum(1)"),
-        ("(groups.in_view), groups.size)", "(groups.in_view), 0 * groups.size)"),
+        ("COST_CLAMP * size).sum(1)", "0.0 * size).sum(1)"),
+        ("between(in_view), size)", "between(in_view), 0 * size)"),
         ("weight = position - below", "weight = (position - below).round()"),
         ('mode="nearest-exact").flatten()', 'mode="bilinear").flatten()'),
         ("IN_VIEW_RECTIFIED, IN_VIEW_POSED = 0.6, 0.25", "IN_VIEW_RECTIFIED, IN_VIEW_POSED = 0.95, 0.95"),
@@ -261,7 +261,7 @@ MUTANTS = [
     ),
     *of(
         "pose/refine.py",
-        ("DEPTH_SPREAD**2 + misfit**2", "DEPTH_SPREAD**2 + misfit"),
+        ("+ misfit**2 + uneven**2", "+ misfit"),
         ("weight = of_length /", "weight = of_depth /"),
         ("LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.05", "LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.06"),
         (
