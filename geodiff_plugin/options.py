@@ -6,6 +6,7 @@ Nothing here imports torch: ``geodiff --help`` and what is wrong with an option 
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import re
 from collections.abc import Callable
@@ -30,6 +31,12 @@ class Command(NamedTuple):
     options: type | None
     run: Callable[[Any], Any]
     about: str
+
+
+def imported(where: str) -> Any:
+    """Something of this package by its dotted name (``cli.info.run_info``), imported now."""
+    module, _, name = where.rpartition(".")
+    return getattr(importlib.import_module(f"geodiff_plugin.{module}"), name)
 
 
 def declare(

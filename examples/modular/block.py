@@ -36,12 +36,12 @@ from diffusers.utils.torch_utils import randn_tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.guidance.inputs import left_images
 from geodiff_plugin.priors import prior_of
 from geodiff_plugin.runtime.estimate import ProcessingGrid
 from geodiff_plugin.runtime.hooks import frozen_weights
 from geodiff_plugin.runtime.output import assemble_output
+from geodiff_plugin.runtime.pipeline import guided_steps
 from geodiff_plugin.runtime.run import GuidedRun
 
 UNET = ComponentSpec("unet", UNet2DConditionModel)
@@ -334,7 +334,7 @@ class GeometryEvidenceStep(Block):
         knobs = {**(block_state.knobs or {}), "points": block_state.points}
         guidance = GeometryGuidance(block_state.right, block_state.K, block_state.E, **knobs)
         asked = block_state.num_inference_steps
-        steps, rounds = count_steps(guidance.denoising_steps(asked, 1), asked, prior.max_steps)
+        steps, rounds = guided_steps(host, guidance, asked)
         evidence = guidance.prepare(left_images(block_state.image).to(host.vae.device))
         signature = inspect.signature(host.__call__)
         call = {name: value.default for name, value in signature.parameters.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 import os
 import sys
@@ -18,19 +17,17 @@ from geodiff_plugin.cli.commands import new_group
 from geodiff_plugin.cli.options import CaptureOptions, DepthOptions, start_pair
 from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, StopWatch
 from geodiff_plugin.formats.out import free_folder
-from geodiff_plugin.options import OUTPUT, SPACES, Command, PriorOptions, declare, help_of
+from geodiff_plugin.options import OUTPUT, SPACES, Command, PriorOptions, declare, help_of, imported
 
 _out = partial(declare, panel=OUTPUT)
 
 
-def _imported(where: str) -> Callable[..., Any]:
-    """A function of the package, imported when it is needed."""
+def _imported(where: str) -> Any:
+    """As ``imported``, with threads as a command wants them."""
     # OpenMP's threads spin while they wait, which on a busy machine takes the core from the thread that they
     # wait for; asleep they cost one call in ten on an idle machine and save half of it on a busy one.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    module, _, name = where.rpartition(".")
-    function: Callable[..., Any] = getattr(importlib.import_module(f"geodiff_plugin.{module}"), name)
-    return function
+    return imported(where)
 
 
 def _later(where: str) -> Callable[[Any], None]:

@@ -11,7 +11,6 @@ from functools import partial
 
 import torch
 
-from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
 from geodiff_plugin.cli.depth import estimate_and_write, load_guided_prior
 from geodiff_plugin.cli.options import DepthOptions
@@ -22,8 +21,8 @@ from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
-from geodiff_plugin.priors import prior_of
 from geodiff_plugin.runtime.machine import pick_device, timed
+from geodiff_plugin.runtime.pipeline import guided_steps
 
 CELL_WIDTH = 360
 #: Calls of which the fastest counts.
@@ -61,11 +60,11 @@ def run_bench(prior: str, space: str | None, steps: int | None, seed: int, devic
     where = f"{place}, {torch.get_num_threads()} threads, torch {torch.__version__}"
     pipe, cameras = load_guided_prior(prior, place, space), (pair.rig.K_left, pair.rig.K_right)
     guidance = GeometryGuidance(pair.right, cameras, pair.rig.E)
-    wanted = guidance.denoising_steps(steps, pipe.default_denoising_steps)
-    count, _ = count_steps(wanted, steps, prior_of(pipe).max_steps)
+    count, _ = guided_steps(pipe, guidance, steps)
+    generator = torch.Generator("cpu").manual_seed(seed)
     table, fastest = new_table(("", "seconds", "time x")), list[float]()
     for name, given in (("plain", None), ("guided", guidance)):
-        call = partial(pipe, pair.left, guidance=given, num_inference_steps=count)
+        call = partial(pipe, pair.left, guidance=given, num_inference_steps=count, generator=generator)
         fastest.append(min(timed(call, place) for _ in range(CALLS)))
         table.add_row(name, f"{fastest[-1]:.2f}", f"{fastest[-1] / fastest[0]:.2f}")
     left, right, calib = (str(DEMO_PAIR_FOLDER / name) for name in ("left.png", "right.png", "calib.txt"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import shlex
 from collections.abc import Collection
 from dataclasses import MISSING, dataclass, field, fields
@@ -19,6 +18,7 @@ from geodiff_plugin.options import (
     check_options,
     declare,
     flag_of,
+    imported,
 )
 
 if TYPE_CHECKING:
@@ -205,26 +205,25 @@ class CaptureEvalOptions(EvalOptions):
 
 def _run(name: str, where: str, options: OutOptions) -> Any:
     """The page, the path of a figure, or ``None`` in a process that writes nothing."""
-    module, _, function = where.partition(":")
-    return getattr(importlib.import_module(f"geodiff_plugin.evaluation.{module}"), function)(name, options)
+    return imported(f"evaluation.{where}")(name, options)
 
 
-_PAPER, _CHANGES = "paper:run_paper_table", "pairs:run_changes"
+_PAPER, _CHANGES = "paper.run_paper_table", "pairs.run_changes"
 _TABLE: dict[str, tuple[type[OutOptions], str, str]] = {
-    "pairs": (DirOptions, "pairs:run_pairs", "Methods side by side on every metric pair below DIR."),
+    "pairs": (DirOptions, "pairs.run_pairs", "Methods side by side on every metric pair below DIR."),
     "table1": (PairsOptions, _PAPER, "Table 1: KITTI, Booster and Middlebury, in metres and aligned."),
     "table2": (PairsOptions, _PAPER, "Table 2: Booster, beside stereo."),
     "table3": (PairsOptions, _PAPER, "Table 3: two posed views, Tanks and Temples."),
     "ablation": (PairsOptions, _PAPER, "Table 4, and one change at a time: gradients, rules, terms."),
     "parts": (PairsOptions, _CHANGES, "The default with one of its parts left out at a time."),
     "flatness": (PairsOptions, _CHANGES, "Every number of the default, at half and at twice."),
-    "cost": (PairsOptions, "pairs:run_cost", "Seconds and peak memory, plain against guided."),
-    "strength": (StrengthOptions, "strength:run_strength", "Emulated priors from exact to weak."),
-    "sequence": (SequenceOptions, "frames:run_sequence", "Frames of a moving rig; error, flicker."),
-    "figure": (FigureOptions, "figures:run_figure", "Draw one figure as PNG, its numbers as JSON."),
-    "trust": (TrustOptions, "calibrations:run_trust", "How many wrong calibrations are detected."),
-    "poses": (PosesOptions, "calibrations:run_poses", "Poses given, perturbed, refined, estimated."),
-    "capture": (CaptureEvalOptions, "frames:run_capture_eval", "Depth of a capture (extra capture)."),
+    "cost": (PairsOptions, "pairs.run_cost", "Seconds and peak memory, plain against guided."),
+    "strength": (StrengthOptions, "strength.run_strength", "Emulated priors from exact to weak."),
+    "sequence": (SequenceOptions, "frames.run_sequence", "Frames of a moving rig; error, flicker."),
+    "figure": (FigureOptions, "figures.run_figure", "Draw one figure as PNG, its numbers as JSON."),
+    "trust": (TrustOptions, "calibrations.run_trust", "How many wrong calibrations are detected."),
+    "poses": (PosesOptions, "calibrations.run_poses", "Poses given, perturbed, refined, estimated."),
+    "capture": (CaptureEvalOptions, "frames.run_capture_eval", "Depth of a capture (extra capture)."),
 }
 #: Every command but ``list``, by name.
 COMMANDS = {

@@ -39,7 +39,7 @@ class Buffers:
         return held[:count].view(size[0], planes, size[1]).transpose(0, 1)
 
 
-def _scan_rows(cost: Tensor, p1: int, p2: Tensor, total: Tensor, fresh: bool) -> None:
+def _scan_rows(cost: Tensor, p1: int, p2: Tensor, total: Tensor, *, fresh: bool) -> None:
     """Add the path from the first row down and that from the last row up to ``total (D, N, M)`` int16.
 
     ``cost (D, N, M)`` uint8; ``p1`` is the penalty of a step of one plane, ``p2 (N, M)`` int16 that of any
@@ -99,8 +99,8 @@ def aggregate(levels: Tensor, grey: Tensor, *, buffers: Buffers | None = None) -
     # Contiguous copies plane by plane make the transposition several times as fast.
     for plane, source in zip(turned, levels, strict=True):
         plane.copy_(source.contiguous().T.contiguous())
-    _scan_rows(turned, step, horizontal, sideways, True)
+    _scan_rows(turned, step, horizontal, sideways, fresh=True)
     for plane, source in zip(total, sideways, strict=True):
         plane.copy_(source.contiguous().T.contiguous())
-    _scan_rows(levels, step, vertical, total, False)
+    _scan_rows(levels, step, vertical, total, fresh=False)
     return total

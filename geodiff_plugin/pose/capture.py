@@ -39,8 +39,8 @@ SCALE_FLOOR_TRAJECTORY, SCALE_FLOOR_DEPTH = 0.02, 0.015
 DISAGREES = 0.1
 #: Another convention of the given poses is taken where it leaves this share of their misfit at most.
 CONVENTION_GAIN = 0.5
-#: A given position is named as wrong if it moved so many times as far as the median one, and by this share of
-#: the size of the whole trajectory.
+#: A given position is reported as wrong if the solve moves it this many times as far as the median one, and
+#: by this share of the size of the trajectory.
 FAR_TIMES, FAR_SHARE = 10.0, 0.1
 #: Names that a sentence gives.
 MOST_NAMES = 5
@@ -355,7 +355,8 @@ def _noted(result: SolvedCapture, notes: list[str], names: Sequence[str]) -> Sol
     if result.status == "solved" and result.E_given is not None:
         moved, size = result.moved()[0], np.linalg.norm(np.ptp(result.E_given[:, :3, 3], axis=0))
         least = max(FAR_TIMES * float(np.nanmedian(moved)), FAR_SHARE * float(size))
-        if wrong := [name for name, by in zip(names, moved, strict=True) if by > least]:
+        far = result.connected & (moved > least)  # the others keep their poses
+        if wrong := [name for name, is_far in zip(names, far, strict=True) if is_far]:
             notes.append(
                 f"The given poses of {_some_names(wrong)} are far from where the pictures put these frames, "
                 "and are not used."

@@ -104,7 +104,7 @@ def test_other_conventions_are_found_by_the_residuals(form, name):
     assert turn_error_deg(found.E) < 0.5
 
 
-def test_a_blurred_frame_keeps_its_pose_and_is_named_as_is_a_wrong_pose():
+def test_a_blurred_frame_and_a_wrong_pose_are_named():
     images = [grey(E) for E in TRUE]
     images[4] = cv2.blur(images[4], (61, 61))
     given = GIVEN.copy()
