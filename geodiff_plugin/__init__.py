@@ -19,8 +19,8 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time names are i
     from geodiff_plugin.bundled import load_bundled_prior as load_bundled_prior
     from geodiff_plugin.capture.capture import Capture as Capture
     from geodiff_plugin.config import GuidanceConfig as GuidanceConfig
+    from geodiff_plugin.evidence.guidance import GeometryGuidance as GeometryGuidance
     from geodiff_plugin.formats.reading import read_calibration as read_calibration
-    from geodiff_plugin.guidance.guidance import GeometryGuidance as GeometryGuidance
     from geodiff_plugin.priors import PRIORS as PRIORS
     from geodiff_plugin.priors import load_prior as load_prior
     from geodiff_plugin.runtime.pipeline import GuidedMarigoldDepthPipeline as GuidedMarigoldDepthPipeline
@@ -38,7 +38,7 @@ _NAMES_OF = {
     "capture.capture": "Capture",
     "config": "GuidanceConfig",
     "formats.reading": "read_calibration",
-    "guidance.guidance": "GeometryGuidance",
+    "evidence.guidance": "GeometryGuidance",
     "priors": "PRIORS load_prior",
     "runtime.pipeline": "GuidedMarigoldDepthPipeline disable_geometry_guidance enable_geometry_guidance",
     "types": "MetricDepthOutput Rig",

@@ -132,7 +132,7 @@ class MetricDepthOutput(BaseOutput):
         history: one ``StepReport`` per round of a guided step and batch chunk.
         poses: one ``PoseReport`` per image with right views.
         extras: further maps of the prior by name (GeoWizard's ``"normals"``), but for their channels.
-        verdicts: one ``runtime.verdict.Verdict`` per image: whether the depth can be trusted, and why not.
+        verdicts: one ``result.verdict.Verdict`` per image: whether the depth can be trusted, and why not.
         unit: ``"m"``, or ``None`` if no length is known: lengths are then in the unit of the given poses, or
             of the first estimated baseline.
         scale_from: source of the scale of estimated poses: ``"baseline"``, ``"known length"``, ``"points"``,

@@ -219,7 +219,7 @@ MUTANTS = [
         ("config.start <= i / count < config.stop", "config.start <= i / count <= config.stop"),
     ),
     *of(
-        "algorithm/finish.py",
+        "result/full_resolution.py",
         ("BRIGHTNESS, REACH = 0.1, 1.5", "BRIGHTNESS, REACH = 0.12, 1.5"),
         ("MAP_VOTE, WEAK_PRIOR = 0.03, 0.2", "MAP_VOTE, WEAK_PRIOR = 0.04, 0.2"),
         ("clamp_min(1.0) ** 3", "clamp_min(1.0) ** 2"),
@@ -231,7 +231,7 @@ MUTANTS = [
         tests=(f"{UNIT}algorithm.py",),
     ),
     *of(
-        "runtime/confidence.py",
+        "result/confidence.py",
         ("(-0.228, 0.788, 2.42, 0.0864, -15.0)", "(-0.328, 0.788, 2.42, 0.0864, -15.0)"),
         ("(-0.228, 0.788, 2.42, 0.0864, -15.0)", "(-0.228, 0.788, 2.42, 0.0864, -12.0)"),
         ("_HALF_KNOWN = 0.1", "_HALF_KNOWN = 0.12"),
@@ -249,7 +249,7 @@ MUTANTS = [
         tests=("tests/parity/test_scheduler_parity.py",),
     ),
     *of(
-        "runtime/output.py",
+        "result/output.py",
         ("factor = 1.0 / float(over_prior.median())", "factor = float(over_prior.median())"),
         ("output.unit, output.scale_from", "_, output.scale_from"),
         tests=(f"{UNIT}metric_priors.py",),

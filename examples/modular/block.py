@@ -36,11 +36,11 @@ from diffusers.utils.torch_utils import randn_tensor
 from transformers import CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin.guidance.inputs import left_images
+from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.priors import prior_of
+from geodiff_plugin.result.output import assemble_output
 from geodiff_plugin.runtime.estimate import ProcessingGrid
 from geodiff_plugin.runtime.hooks import frozen_weights
-from geodiff_plugin.runtime.output import assemble_output
 from geodiff_plugin.runtime.pipeline import guided_steps
 from geodiff_plugin.runtime.run import GuidedRun
 

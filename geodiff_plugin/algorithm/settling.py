@@ -14,9 +14,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.terms import Objective
 from geodiff_plugin.config import GuidanceConfig
+from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.scale.points import depth_span, fit_to_points, ordered, refine_to_matches
 from geodiff_plugin.scale.space import AffineState, MetricMap, smooth_floor
 from geodiff_plugin.scale.volume_search import search_scale

@@ -11,11 +11,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.algorithm.correction import correction_target, fit_depth, local_error, prior_error
-from geodiff_plugin.algorithm.evidence import Evidence, chunk_views, within
 from geodiff_plugin.algorithm.gradients import RULES, SUMMED, FiniteWatch
 from geodiff_plugin.algorithm.settling import search_one_number, settle_ends, span_of_points
 from geodiff_plugin.algorithm.terms import Loss, Objective
 from geodiff_plugin.config import GuidanceConfig
+from geodiff_plugin.evidence.evidence import Evidence, chunk_views, within
 from geodiff_plugin.matching import Matches, reject_reflections
 from geodiff_plugin.scale.points import order_agreement
 from geodiff_plugin.scale.space import AffineState, MetricMap

@@ -15,8 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.evidence import Views
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
+from geodiff_plugin.evidence.evidence import Views
 from geodiff_plugin.geometry import hidden_in_right, image_size, warp_right_to_left
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import AffineState, MetricMap

@@ -15,11 +15,11 @@ import torch
 from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin._threads import available_cores
 from geodiff_plugin.capture import NEIGHBOURS, POINTS
+from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats.captures import CaptureFrame, read_capture
 from geodiff_plugin.formats.depth import read_depth_png
 from geodiff_plugin.formats.images import read_image, undistorted
 from geodiff_plugin.formats.recordings import VideoReader
-from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.pose.capture import SolvedCapture, solve_capture
 from geodiff_plugin.types import MetricDepthOutput
 

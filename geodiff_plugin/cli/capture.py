@@ -32,9 +32,9 @@ from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
 from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, check_new, write_text
 from geodiff_plugin.pose.capture import SolvedCapture
+from geodiff_plugin.result.verdict import UNTESTED
 from geodiff_plugin.runner import BROKEN, Item, Journal, Runner, fingerprint, this_process
 from geodiff_plugin.runtime.machine import pick_device
-from geodiff_plugin.runtime.verdict import UNTESTED
 from geodiff_plugin.types import MetricDepthOutput
 
 POSES_FILE, JOURNAL = "poses.npz", "frames.jsonl"

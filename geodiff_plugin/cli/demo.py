@@ -17,9 +17,9 @@ from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.cli.outputs import single_map, summary_line
 from geodiff_plugin.cli.terminal import StopWatch, new_table, say, show
 from geodiff_plugin.evaluation.metrics import align, evaluate_depth
+from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.formats.out import OutFolder
-from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
 from geodiff_plugin.runtime.machine import pick_device, timed
 from geodiff_plugin.runtime.pipeline import guided_steps

@@ -20,6 +20,8 @@ from geodiff_plugin._checks import bad_value, warn
 from geodiff_plugin.cli.options import PARAMETERS, DepthOptions
 from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.config import GuidanceConfig
+from geodiff_plugin.evidence.guidance import GeometryGuidance, assume_same_centre
+from geodiff_plugin.evidence.prepare import cleaned
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
 from geodiff_plugin.formats.depth import depth_of_disparity, read_confidence, read_map
 from geodiff_plugin.formats.images import (
@@ -32,8 +34,6 @@ from geodiff_plugin.formats.images import (
     warn_of_other_lens,
 )
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
-from geodiff_plugin.guidance.evidence import cleaned
-from geodiff_plugin.guidance.guidance import GeometryGuidance, assume_same_centre
 from geodiff_plugin.types import Distortion, Rig
 
 Size = tuple[int, int]

@@ -25,12 +25,12 @@ from geodiff_plugin.cli.options import PARAMETERS, DepthOptions, start_pair
 from geodiff_plugin.cli.outputs import read_report
 from geodiff_plugin.cli.pairs import COLUMNS, SUMMARY, PairRef, options_of, start_many
 from geodiff_plugin.cli.terminal import collected_warnings, new_table, say, show
+from geodiff_plugin.evidence.inputs import left_images
+from geodiff_plugin.evidence.prepare import EvidenceStore
 from geodiff_plugin.formats import recordings
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import REPORT, atomic_path, check_new_file, reason_of, write_text
 from geodiff_plugin.formats.reading import has_pose_per_image
-from geodiff_plugin.guidance.evidence import EvidenceStore
-from geodiff_plugin.guidance.inputs import left_images
 from geodiff_plugin.options import flag_of
 from geodiff_plugin.runner import BROKEN, Item, Journal, Runner
 from geodiff_plugin.runtime.machine import pick_device

@@ -19,13 +19,13 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.cli.inputs import Inputs
 from geodiff_plugin.cli.options import DepthOptions, told_apart
 from geodiff_plugin.cli.terminal import say
+from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats.depth import disparity_of_depth
 from geodiff_plugin.formats.files import read_npy
 from geodiff_plugin.formats.out import REPORT, check_new_file, write_text
-from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.runtime.confidence import expected_error
+from geodiff_plugin.result.confidence import expected_error
+from geodiff_plugin.result.verdict import UNTESTED
 from geodiff_plugin.runtime.machine import versions
-from geodiff_plugin.runtime.verdict import UNTESTED
 from geodiff_plugin.types import MetricDepthOutput
 
 #: Benchmarks by name, and where their files lie below the folder of a submission.

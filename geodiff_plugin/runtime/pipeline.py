@@ -15,14 +15,14 @@ from tqdm.auto import tqdm
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, noted, refuse, warn
 from geodiff_plugin.algorithm.schedule import count_steps
-from geodiff_plugin.guidance.guidance import GeometryGuidance
-from geodiff_plugin.guidance.inputs import left_images
+from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.priors import DepthPrior, prior_of
 from geodiff_plugin.priors.pipeline import RESAMPLING, DepthDiffusionPipeline
+from geodiff_plugin.result.output import assemble_output, ensemble_metric, image_labels
 from geodiff_plugin.runtime.estimate import ProcessingGrid, tiny_autoencoder
 from geodiff_plugin.runtime.hooks import Exclusive, networks_of
 from geodiff_plugin.runtime.noise_levels import check_scheduler
-from geodiff_plugin.runtime.output import assemble_output, ensemble_metric, image_labels
 from geodiff_plugin.runtime.run import GuidedRun, StepCallback, depth_prompt
 
 #: What every stock pipeline's call takes, whatever the prior.

@@ -13,13 +13,13 @@ from tqdm.auto import tqdm
 
 from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.algorithm.correction import fit_depth, local_error, prior_error
-from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.schedule import Schedule, make_schedule
 from geodiff_plugin.algorithm.state import Trajectory
 from geodiff_plugin.algorithm.step import guided_step
 from geodiff_plugin.config import GuidanceConfig
+from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.geometry import image_size
-from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.matching import Matches, with_points
 from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.runtime import hooks

@@ -28,7 +28,7 @@ from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.experiment import DENSE
 from geodiff_plugin.evaluation.options import STRENGTHS
 from geodiff_plugin.evaluation.strength import EmulatedPrior
-from geodiff_plugin.guidance.guidance import GeometryGuidance
+from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.matching import consistency
 from geodiff_plugin.runtime import confidence
 
@@ -128,7 +128,7 @@ def _drawn(evidence: np.ndarray, right: np.ndarray, where: np.ndarray, seed: int
 
 
 def observe_depth(sample: StereoSample, settings: Settings, priors: PriorCache) -> Observed:
-    """Evidence of ``runtime.confidence`` of a guided call, and where its depth is within 10 %.
+    """Evidence of ``result.confidence`` of a guided call, and where its depth is within 10 %.
 
     Args:
         sample: with truth.
@@ -286,7 +286,7 @@ def main(
             observe_matches,
             ("matching/consistency.py", "LOG_ODDS", MATCH_SIGNS, consistency.LOG_ODDS),
         ),
-        "depth": (observe_depth, ("runtime/confidence.py", "BY_EVIDENCE", SIGNS, confidence.BY_EVIDENCE)),
+        "depth": (observe_depth, ("result/confidence.py", "BY_EVIDENCE", SIGNS, confidence.BY_EVIDENCE)),
     }
     settings = [
         Settings(prior=one, ensemble=ensemble, resolution=resolution, device=device)

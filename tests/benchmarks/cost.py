@@ -29,8 +29,8 @@ from diffusers.utils import logging as diffusers_logging
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.bundled.demo_pair import DemoPair, read_demo_pair
+from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.geometry import resize_intrinsics
-from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.matching import build
 from geodiff_plugin.priors import load_prior
 from geodiff_plugin.runtime.machine import PeakMemory

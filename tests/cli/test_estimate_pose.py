@@ -11,8 +11,8 @@ from PIL import Image
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.inputs import lenses_of, read_inputs
 from geodiff_plugin.cli.options import DepthOptions
+from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats.images import distortion_from_text
-from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.types import Rig
 from tests.cli.conftest import report_of
 from tests.scenes import render_pair

@@ -20,12 +20,11 @@ from geodiff_plugin.algorithm.correction import (
     off_edges,
     prior_error,
 )
-from geodiff_plugin.algorithm.evidence import chunk_views, prepare_evidence
-from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth
 from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.schedule import make_schedule
 from geodiff_plugin.algorithm.terms import Objective, match_exposure, photometric, ssim
 from geodiff_plugin.config import DEFAULT, MARIGOLD_DC, PAPER, UpdatePlan
+from geodiff_plugin.evidence.evidence import chunk_views, prepare_evidence
 from geodiff_plugin.formats.images import intrinsics_from_exif
 from geodiff_plugin.geometry import hidden_in_right, is_rectified, project, resize_image, warp_right_to_left
 from geodiff_plugin.matching import build_cost_volume, points_to_matches, with_points
@@ -35,7 +34,8 @@ from geodiff_plugin.matching.matches import Matches, reject_reflections
 from geodiff_plugin.pose.estimate import find_scale
 from geodiff_plugin.pose.refine import Displacement, fit_displacement, refined_scale, straightened
 from geodiff_plugin.pose.tracks import Tracks, project_tracks, solve_inverse_depth
-from geodiff_plugin.runtime.confidence import depth_confidence, reprojection
+from geodiff_plugin.result.confidence import depth_confidence, reprojection
+from geodiff_plugin.result.full_resolution import sharpen_edges, vote_depth
 from geodiff_plugin.scale.points import (
     depth_span,
     fit_to_points,

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from geodiff_plugin.algorithm.denoising import NoiseLevel, noise_from, output_from, z0_from
-from geodiff_plugin.algorithm.evidence import Views
 from geodiff_plugin.algorithm.terms import Objective
 from geodiff_plugin.config import GuidanceConfig
+from geodiff_plugin.evidence.evidence import Views
 from geodiff_plugin.geometry import plane_rays
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.priors.marigold import MarigoldPrior

@@ -9,7 +9,7 @@ from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImage
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, InputError
-from geodiff_plugin.guidance.inputs import left_images
+from geodiff_plugin.evidence.inputs import left_images
 
 LEFT = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
 FLOATS = LEFT.astype(np.float32) / 255

@@ -25,7 +25,7 @@ from geodiff_plugin.evaluation.frames import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
 from geodiff_plugin.plotting import grid
 from geodiff_plugin.pose.capture import SolvedCapture, candidate_pairs, solve_capture
-from geodiff_plugin.runtime.verdict import Indicators, judge
+from geodiff_plugin.result.verdict import Indicators, judge
 from tests.cli.conftest import call
 from tests.unit.capture_room import FLIP, HALF, SIZE, K, perturbed, render, walk, write_transforms
 

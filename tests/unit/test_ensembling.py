@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from geodiff_plugin.runtime.output import ensemble_metric, median
+from geodiff_plugin.result.output import ensemble_metric, median
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin.algorithm.evidence import chunk_views, prepare_evidence
 from geodiff_plugin.algorithm.terms import Objective
 from geodiff_plugin.config import GuidanceConfig
+from geodiff_plugin.evidence import prepare
+from geodiff_plugin.evidence.evidence import chunk_views, prepare_evidence
+from geodiff_plugin.evidence.inputs import Inputs
+from geodiff_plugin.evidence.prepare import EvidenceStore
 from geodiff_plugin.geometry import warp_right_to_left
-from geodiff_plugin.guidance import evidence
-from geodiff_plugin.guidance.evidence import EvidenceStore
-from geodiff_plugin.guidance.inputs import Inputs
 from geodiff_plugin.scale.space import MetricMap
 from geodiff_plugin.types import CameraView
 from tests.benchmarks.matching import textured_pair
@@ -84,7 +84,7 @@ SETTINGS = (GuidanceConfig(), True)
 def made(monkeypatch):
     """The calls that reach ``make_evidence``, answered by their number."""
     calls = []
-    monkeypatch.setattr(evidence, "make_evidence", lambda *given: calls.append(given) or len(calls))
+    monkeypatch.setattr(prepare, "make_evidence", lambda *given: calls.append(given) or len(calls))
     return calls
 
 

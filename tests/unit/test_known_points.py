@@ -9,9 +9,9 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin._checks import InputError
+from geodiff_plugin.evidence.inputs import as_points
 from geodiff_plugin.formats import read_points, rig_from_parameters, write_depth_mm, write_pfm
 from geodiff_plugin.formats.depth import depth_of_disparity, read_confidence
-from geodiff_plugin.guidance.inputs import as_points
 from geodiff_plugin.matching import points_to_matches, with_points
 from geodiff_plugin.scale.points import depth_span
 

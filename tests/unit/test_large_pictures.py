@@ -9,7 +9,7 @@ from geodiff_plugin.formats import depth as strips
 from geodiff_plugin.formats import flying_points, make_cloud, write_depth_mm, write_ply
 from geodiff_plugin.formats.depth import read_ply_points
 from geodiff_plugin.plotting import colour_depth, share_figure
-from geodiff_plugin.runtime.confidence import depth_confidence, reprojection
+from geodiff_plugin.result.confidence import depth_confidence, reprojection
 from geodiff_plugin.types import CameraView
 
 

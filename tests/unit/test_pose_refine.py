@@ -16,7 +16,7 @@ from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
 from geodiff_plugin.pose.refine import fit_displacement, refine_views, straightened, undecided
 from geodiff_plugin.pose.solve import PosePrior, is_rig, settle_poses, solve_poses
 from geodiff_plugin.pose.tracks import Tracks, median_residuals, residuals_px, solve_inverse_depth
-from geodiff_plugin.runtime.verdict import read_indicators
+from geodiff_plugin.result.verdict import read_indicators
 from geodiff_plugin.types import CameraView
 from tests.scenes import render_pair
 

@@ -6,9 +6,9 @@ import torch
 
 from geodiff_plugin import GeometryGuidance, geometry
 from geodiff_plugin._camera_checks import check_intrinsics, check_size_of
-from geodiff_plugin.algorithm.evidence import prepare_evidence
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evaluation.figures import render_cloud
+from geodiff_plugin.evidence.evidence import prepare_evidence
 from geodiff_plugin.formats.clouds import write_ply
 from geodiff_plugin.matching import build_cost_volume, match_volume, points_to_matches
 from geodiff_plugin.matching.build import inverse_pose_preferred, pilot_volume, to_grid

@@ -10,8 +10,8 @@ import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.runtime.confidence import depth_confidence
-from geodiff_plugin.runtime.verdict import Indicators, judge
+from geodiff_plugin.result.confidence import depth_confidence
+from geodiff_plugin.result.verdict import Indicators, judge
 from tests.scenes import render_pair
 
 GOOD = Indicators(confidence=0.85, matched=0.8, order=0.8, spread=0.7, baseline_m=0.12, view_deg=60.0)

@@ -25,9 +25,9 @@ from geodiff_plugin.evaluation.baselines.guided import (
     guided_map,
 )
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, disparity_to_depth, read_depth_m
+from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats import as_image_01, read_depth_png
 from geodiff_plugin.formats.depth import read_map
-from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.matching import CostVolume, build_cost_volume, match_volume
 from geodiff_plugin.matching.rows import PARAMETERS, fill_background, make_matcher, pad_columns
 from geodiff_plugin.types import CameraView

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.evidence import Evidence
+from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.pose.mistakes import INVERSE

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from geodiff_plugin._camera_checks import check_intrinsics, check_intrinsics_fit
 from geodiff_plugin._checks import bad_type, bad_value, check_number
-from geodiff_plugin.algorithm.evidence import Evidence, prepare_evidence
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
+from geodiff_plugin.evidence.evidence import Evidence, prepare_evidence
+from geodiff_plugin.evidence.inputs import Inputs, as_points
 from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.geometry import image_size, resize_intrinsics, unproject
-from geodiff_plugin.guidance.inputs import Inputs, as_points
 from geodiff_plugin.matching import clean
 from geodiff_plugin.pose.estimate import Scale, estimate_poses, find_scale, polished
 from geodiff_plugin.pose.refine import refine_views, untouched

@@ -16,15 +16,15 @@ from torch import Tensor
 
 from geodiff_plugin._checks import InputError, check_choice
 from geodiff_plugin.algorithm.correction import correction_target, fit_depth
-from geodiff_plugin.algorithm.finish import sharpen_edges, vote_depth
+from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.geometry import image_size, resize_intrinsics
-from geodiff_plugin.guidance.guidance import GeometryGuidance
 from geodiff_plugin.matching import Matches, build_cost_volume, match_volume
 from geodiff_plugin.pose.estimate import NO_UNIT
 from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.runtime.confidence import depth_confidence, reprojection
+from geodiff_plugin.result.confidence import depth_confidence, reprojection
+from geodiff_plugin.result.full_resolution import sharpen_edges, vote_depth
+from geodiff_plugin.result.verdict import Indicators, Verdict, judge, points_agreement, read_indicators
 from geodiff_plugin.runtime.run import GuidedRun
-from geodiff_plugin.runtime.verdict import Indicators, Verdict, judge, points_agreement, read_indicators
 from geodiff_plugin.scale.points import order_agreement
 from geodiff_plugin.types import MetricDepthOutput
 

@@ -12,14 +12,14 @@ from torch import Tensor
 from geodiff_plugin._camera_checks import check_calibrated_size, check_size_of
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, check_size, noted, refuse
 from geodiff_plugin._threads import WithinCores
-from geodiff_plugin.algorithm.evidence import Evidence
 from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.terms import TERMS
 from geodiff_plugin.config import PRESETS, GuidanceConfig, UpdatePlan
+from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.evidence.inputs import read_inputs, split_views
+from geodiff_plugin.evidence.prepare import EstimatedRig, EvidenceStore, estimate_rig, make_evidence
 from geodiff_plugin.formats import picture_size, read_calibration
 from geodiff_plugin.geometry import image_size
-from geodiff_plugin.guidance.evidence import EstimatedRig, EvidenceStore, estimate_rig, make_evidence
-from geodiff_plugin.guidance.inputs import read_inputs, split_views
 from geodiff_plugin.types import Rig
 
 #: The assumption about a rectified pair if only one K is given.
