@@ -11,6 +11,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "geodiff_plugin"
 LAYER = {
     "_camera_checks": 0,
     "_checks": 0,
+    "_kernels": 0,
     "_threads": 0,
     "types": 0,
     "geometry": 1,

@@ -1,0 +1,47 @@
+"""Which implementation of a stage runs: its Triton kernel, or its reference in plain torch.
+
+Every kernel stands beside its reference, which stays the truth. A kernel runs on CUDA where Triton can be
+imported (it ships with torch for Linux), unless ``without_kernels`` switches it off. With the environment
+variable ``TRITON_INTERPRET=1`` kernels also run on CPU tensors, which is how tests compare both without a GPU.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+import torch
+
+_switched_on: ContextVar[bool] = ContextVar("geodiff_kernels", default=True)
+
+
+@functools.cache
+def has_triton() -> bool:
+    """Whether Triton is installed."""
+    return importlib.util.find_spec("triton") is not None
+
+
+def interpreting() -> bool:
+    """Whether Triton's interpreter runs kernels on the CPU, as Triton itself reads it when it is imported."""
+    return os.environ.get("TRITON_INTERPRET", "0") == "1"
+
+
+def use_kernel(tensor: torch.Tensor) -> bool:
+    """Whether a stage that works on ``tensor`` runs its kernel; otherwise its reference runs."""
+    # ROCm devices are called "cuda" as well; the kernels were never run there.
+    on_device = tensor.is_cuda and torch.version.hip is None
+    return _switched_on.get() and has_triton() and (on_device or interpreting())
+
+
+@contextmanager
+def without_kernels(off: bool = True) -> Iterator[None]:
+    """Run the reference of every stage within the block, in this thread, if ``off``."""
+    token = _switched_on.set(_switched_on.get() and not off)
+    try:
+        yield
+    finally:
+        _switched_on.reset(token)
