@@ -2,7 +2,7 @@
 
 Every kernel stands beside its reference, which stays the truth. A kernel runs on CUDA where Triton can be
 imported (it ships with torch for Linux), unless ``without_kernels`` switches it off. With the environment
-variable ``TRITON_INTERPRET=1`` kernels also run on CPU tensors, which is how tests compare both without a GPU.
+variable ``TRITON_INTERPRET=1`` kernels also run on CPU tensors: that is how tests compare both without a GPU.
 """
 
 from __future__ import annotations
