@@ -37,7 +37,7 @@ from geodiff_plugin.runtime.machine import PeakMemory
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from tests.benchmarks.operations import Size, calls_of_all, count_operations
 
-__all__ = ["AXES", "Axis", "exponent", "main", "tables", "with_tables"]
+__all__ = ["AXES", "Axis", "exponent", "main", "resized_pair", "tables", "with_tables"]
 
 BEGIN, END = "<!-- made by tests.benchmarks.cost -->", "<!-- end -->"
 #: Operations a second that a GPU is taken to sustain, in TFLOP/s, for the extrapolation.
@@ -74,7 +74,7 @@ AXES = (
 SIDE = 512
 
 
-def _resized(pair: DemoPair, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def resized_pair(pair: DemoPair, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Both pictures with that longer side, and the cameras ``(2, 3, 3)`` that go with them."""
     height, width = pair.left.shape[:2]
     size = (round(height * side / max(height, width)), round(width * side / max(height, width)))
@@ -104,7 +104,7 @@ def measure(
     """
     torch.set_num_threads(1)
     pair = read_demo_pair()
-    left, right, (K_left, K_right) = _resized(pair, side)
+    left, right, (K_left, K_right) = resized_pair(pair, side)
     # The grid and the number of planes follow the bounds that are measured, and nothing else.
     if "planes" in (knobs or {}):
         build.PLANE_STEP_PX = 0.05

@@ -11,18 +11,17 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
-from typing import Any
 
 import torch
 from diffusers.utils import logging as diffusers_logging
 
 from geodiff_plugin.runtime.machine import PeakMemory, pick_device, timed
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from tests.benchmarks.measuring import waits_by_place
 from tests.benchmarks.operations import WAYS, Size, call_of, calls_of_all, count_operations, tiny_folder
 from tests.benchmarks.random_marigold import random_marigold
 
@@ -55,19 +54,7 @@ def measure(way: str, size: Size, device_name: str, folder: str) -> Found:
         seconds = timed(call, device)
     if size.repeats:
         seconds = min(timed(call, device) for _ in range(size.repeats))
-    return Found(seconds, memory.peak_bytes, _waits(call) if device.type == "cuda" else None)
-
-
-def _waits(call: Callable[[], Any]) -> int:
-    """How often the whole of a call waits for CUDA, evidence and output included."""
-    torch.cuda.set_sync_debug_mode("warn")
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            call()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    return sum("synchroniz" in str(one.message) for one in caught)
+    return Found(seconds, memory.peak_bytes, waits_by_place(call).total() if device.type == "cuda" else None)
 
 
 def _print_counted(size: Size) -> None:

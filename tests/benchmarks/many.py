@@ -14,6 +14,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 import torch
@@ -75,12 +76,13 @@ class ManyPairs:
 
     Args:
         options: of the run.
+        pipe: a guided pipeline, in place of the prior that the options name.
     """
 
-    def __init__(self, options: DepthOptions) -> None:
+    def __init__(self, options: DepthOptions, pipe: Any = None) -> None:
         self._options, self._refs = options, start_many(options)
         self._device = pick_device(options.device)
-        self._pipe = load_guided_prior(options.prior, self._device)
+        self._pipe = load_guided_prior(options.prior, self._device) if pipe is None else pipe
 
     def seconds(self, most: int, shared: bool) -> tuple[float, float]:
         """Seconds of a clock and of all cores for all pairs.

@@ -6,6 +6,8 @@ Paper: S5.1 (the prior of the experiments).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -19,7 +21,7 @@ from diffusers import (
 
 from tests.benchmarks.full_sizes import SCHEDULER, UNET, VAE
 
-__all__ = ["EMPTY_PROMPT_TOKENS", "narrowed", "random_marigold", "random_tiny"]
+__all__ = ["EMPTY_PROMPT_TOKENS", "drawn_on", "narrowed", "random_marigold", "random_tiny"]
 
 EMPTY_PROMPT_TOKENS = 2
 #: Channels come in groups of so many.
@@ -39,6 +41,15 @@ def narrowed(config: dict[str, Any], width: float) -> dict[str, Any]:
     return config | changed
 
 
+@contextmanager
+def drawn_on(device: torch.device | str, seed: int = 0) -> Iterator[None]:
+    """Draw the weights of networks on their device, which a GPU does in a moment; random states stay."""
+    device = torch.device(device)
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []), device:
+        torch.manual_seed(seed)
+        yield
+
+
 def random_marigold(
     seed: int = 0, device: torch.device | str = "cpu", width: float = 1.0, dtype: torch.dtype = torch.float32
 ) -> MarigoldDepthPipeline:
@@ -53,8 +64,7 @@ def random_marigold(
     Returns:
         A pipeline without text encoder, whose embedding of the empty prompt is 0 already.
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+    with drawn_on(device, seed):
         unet = UNet2DConditionModel(**narrowed(UNET, width)).eval()
         vae = AutoencoderKL(**narrowed(VAE, width)).eval()
     pipe = MarigoldDepthPipeline(

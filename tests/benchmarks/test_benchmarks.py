@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ import torch
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from tests.benchmarks import calls, cost, large, many, maps, operations
+from tests.benchmarks import calls, cost, gpu, large, many, maps, operations
 from tests.benchmarks.full_sizes import UNET, VAE
 from tests.benchmarks.matrix import deviation
 from tests.benchmarks.random_marigold import narrowed
@@ -53,7 +55,7 @@ def test_exponent_of_a_power():
 
 
 def test_resized_pictures_keep_their_middle():
-    left, _, cameras = cost._resized(read_demo_pair(), 224)
+    left, _, cameras = cost.resized_pair(read_demo_pair(), 224)
     assert left.shape == (168, 224, 3)
     for K in cameras:
         np.testing.assert_allclose(K[:2, 2], (111.5, 83.5))
@@ -124,3 +126,28 @@ def test_a_better_map_makes_a_better_result():
     for title, (alone, error, sure, trusted) in rows.items():
         assert 0.0 < sure <= 1.0 and trusted in (0, 1) and error < 0.2, title
         assert np.isnan(alone) == title.startswith("none")
+
+
+def test_the_benchmark_of_a_gpu_runs_whole_at_a_tiny_size(tmp_path, capsys):
+    assert gpu.main(["--smoke", "--json", str(tmp_path / "tables.json")]) == 0
+    parts = json.loads((tmp_path / "tables.json").read_text())["parts"]
+    assert list(parts) == list(gpu.PARTS)
+    assert all(part["rows"] and not any("failed" in row for row in part["rows"]) for part in parts.values())
+    ways = {row["way"]: row["ms"] for row in parts["full-size"]["rows"] if "way" in row}
+    assert ways["guided"] > ways["plain"] > 0.0
+    spent = {row["stage"].strip(): row["ms"] for row in parts["stages"]["rows"]}
+    assert 0.0 < spent["refine_to_matches"] < spent["Trajectory.settle_scale"]
+    printed = capsys.readouterr().out
+    assert all(f"\n{name}: " in printed for name in gpu.PARTS)
+
+
+def test_a_part_that_fails_says_why_and_the_next_one_runs(tmp_path, monkeypatch, capsys):
+    def broken(bench):
+        yield {"row": "before the error"}
+        raise ValueError("the card caught fire")
+
+    monkeypatch.setattr(gpu, "PARTS", {"broken": broken, "waits": gpu.waits})
+    assert gpu.main(["--smoke", "--json", str(tmp_path / "tables.json")]) == 1
+    out = capsys.readouterr().out
+    assert "before the error" in out and "ValueError: the card caught fire" in out
+    assert "only CUDA is waited for" in out
