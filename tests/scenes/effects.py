@@ -6,14 +6,14 @@ Data flow: a clean sRGB image -> the same image as a real camera would have writ
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from PIL import Image
 
-__all__ = ["CameraEffects", "apply_effects", "sample_effects"]
+__all__ = ["CameraEffects", "apply_effects", "indoor_cameras", "sample_effects"]
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,25 @@ def sample_effects(rng: np.random.Generator, size: tuple[int, int], grey: float 
         jpeg_quality=int(rng.integers(35, 95)) if rng.random() < 0.35 else 0,
         seed=int(rng.integers(1 << 31)),
     )
+
+
+def indoor_cameras(seed: int) -> tuple[CameraEffects, CameraEffects]:
+    """Both cameras of a small stereo rig in a dim room: noisy, soft, darker in the corners, mostly grey.
+
+    Args:
+        seed: what they are drawn from; the cameras differ in their noise alone.
+    """
+    rng = np.random.default_rng([seed, 54])
+    left = CameraEffects(
+        contrast=float(rng.uniform(0.9, 1.1)),
+        saturation=0.0 if rng.random() < 0.7 else 1.0,
+        vignette=float(rng.uniform(0.1, 0.35)),
+        blur_px=float(rng.uniform(0.3, 0.8)),
+        noise=float(rng.uniform(0.004, 0.016)),
+        jpeg_quality=int(rng.integers(70, 95)) if rng.random() < 0.35 else 0,
+        seed=int(rng.integers(1 << 31)),
+    )
+    return left, replace(left, seed=left.seed + 1)
 
 
 def _blurred(image: torch.Tensor, sigma: float) -> torch.Tensor:

@@ -9,6 +9,7 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value
 from tests.scenes.layouts.corridor import corridor
+from tests.scenes.layouts.plain import plain_room
 from tests.scenes.layouts.room import room
 from tests.scenes.layouts.street import street
 from tests.scenes.layouts.tabletop import tabletop
@@ -17,13 +18,20 @@ from tests.scenes.scene import Scene
 
 __all__ = ["KINDS", "LAYOUTS", "sample_scene"]
 
-LAYOUTS = {"room": room, "street": street, "tabletop": tabletop, "corridor": corridor, "terrain": terrain}
+LAYOUTS = {
+    "room": room,
+    "street": street,
+    "tabletop": tabletop,
+    "corridor": corridor,
+    "terrain": terrain,
+    "plain": plain_room,
+}
 """Layout function of each kind: ``(rng, seed) -> Scene``."""
 
-KINDS: tuple[str, ...] = tuple(LAYOUTS)
-"""Kinds of scene."""
+_WEIGHTS = {"room": 0.34, "street": 0.27, "tabletop": 0.17, "corridor": 0.08, "terrain": 0.14}
 
-_WEIGHTS = (0.34, 0.27, 0.17, 0.08, 0.14)
+KINDS: tuple[str, ...] = tuple(_WEIGHTS)
+"""Kinds of scene that are drawn where none is named."""
 
 
 def sample_scene(seed: int, kind: str | None = None) -> Scene:
@@ -31,7 +39,7 @@ def sample_scene(seed: int, kind: str | None = None) -> Scene:
 
     Args:
         seed: non-negative integer.
-        kind: one of ``KINDS``; None draws one, rooms and streets most often.
+        kind: a key of ``LAYOUTS``; None draws one of ``KINDS``, rooms and streets most often.
 
     Returns:
         The scene with its own camera pose, field of view and plausible baseline.
@@ -42,7 +50,7 @@ def sample_scene(seed: int, kind: str | None = None) -> Scene:
     if seed < 0:
         bad_value("seed", "a non-negative integer", seed)
     rng = np.random.default_rng([int(seed), 20])
-    drawn = KINDS[int(rng.choice(len(KINDS), p=_WEIGHTS))]
+    drawn = KINDS[int(rng.choice(len(KINDS), p=list(_WEIGHTS.values())))]
     if kind is not None and kind not in LAYOUTS:
-        bad_value("kind", f"one of {', '.join(KINDS)}, or None", repr(kind))
+        bad_value("kind", f"one of {', '.join(LAYOUTS)}, or None", repr(kind))
     return LAYOUTS[kind or drawn](rng, int(seed))
