@@ -21,7 +21,6 @@ LAYER = {
     "formats": 3,
     "plotting": 3,
     "pose": 4,
-    "runner": 4,
     "scale": 4,
     "evidence": 5,
     "algorithm": 6,
@@ -33,10 +32,11 @@ LAYER = {
     "result": 7,
     "bundled": 8,
     "capture": 9,
-    "evaluation": 10,
-    "app": 11,
-    "cli": 11,
-    "__main__": 12,
+    "jobs": 10,
+    "evaluation": 11,
+    "app": 12,
+    "cli": 12,
+    "__main__": 13,
 }
 """By part of the package, or by module where a folder lies in two layers: the configuration is below all
 that reads it, what takes images and cameras as a user gives them is above."""

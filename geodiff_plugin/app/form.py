@@ -11,7 +11,7 @@ import gradio as gr
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.app.job import CAMERA_WAYS, LIMITS, Priors, options_of
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
-from geodiff_plugin.cli.options import DepthOptions
+from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.options import PRESETS, help_of
 
 PICTURE_HEIGHT = 190

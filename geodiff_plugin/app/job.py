@@ -13,11 +13,14 @@ from typing import Any
 import torch
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number
-from geodiff_plugin.cli.depth import Job, load_guided_prior
-from geodiff_plugin.cli.options import DepthOptions
-from geodiff_plugin.cli.terminal import collected_warnings
 from geodiff_plugin.formats.files import upright_size
 from geodiff_plugin.formats.out import OutFolder
+from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.jobs.pair import run_pair, write_pair
+from geodiff_plugin.jobs.prior import load_guided_prior
+from geodiff_plugin.jobs.reading import read_pair
+from geodiff_plugin.jobs.records import JobLog, PairResult
+from geodiff_plugin.jobs.telling import collected_warnings, silent
 
 #: What the page allows of an option, where that is less than the command does.
 LIMITS = {"steps": 100, "ensemble": 20, "resolution": 4096}
@@ -115,7 +118,7 @@ def options_of(
 
 def run_job(
     options: DepthOptions, priors: Priors, stop: threading.Event, report: Callable[[float, str], None]
-) -> Job:
+) -> PairResult:
     """Read, estimate, write; ``Stopped`` before a stage or step after ``stop`` was set.
 
     ``report`` is called with the share that is done, [0, 1], and the name of the stage.
@@ -129,12 +132,14 @@ def run_job(
     for name, most in LIMITS.items():
         check_number(getattr(options, name) or 0, FIELD_NAMES.get(name, name), 0, most, integer=True)
     options.check(lambda field: FIELD_NAMES.get(field.name, field.name))
-    job = Job(options, OutFolder(Path(tempfile.gettempdir(), f"geodiff-{secrets.token_hex(8)}")))
-    with collected_warnings(lambda _: None), job.folder:  # the job notes them
+    folder, log = OutFolder(Path(tempfile.gettempdir(), f"geodiff-{secrets.token_hex(8)}")), JobLog()
+    with collected_warnings(silent), folder:  # the log has them
         stage(0.0, "Reading the photographs and cameras")
         # The page keeps what is dropped in folders of its own, so only the names say something.
-        job.read(names=(options.left.name, Path(str(options.right)).name))
-        guidance = job.inputs.guidance
+        names = options.left.name, Path(str(options.right)).name
+        with log.stage("calibration"):
+            inputs = read_pair(options, names=names)
+        guidance = inputs.guidance
         if guidance.unit is None:  # lengths are what the page is for
             cure = "This file has no unit: measure how far the two cameras were from each other, in metres."
             bad_value("the distance of the cameras", "given", "nothing", cure)
@@ -150,8 +155,7 @@ def run_job(
             stage(0.2 + 0.7 * min(done / total, 1.0), f"Guided step {min(done, total)} of {total}")
             return {}
 
-        job.guide(pipe, progress=False, callback_on_step_end=show)
+        run = run_pair(pipe, options, inputs, log, callback_on_step_end=show)
         stage(0.95, "Drawing")
-        job.warnings += [sentence for sentence in job.output.assumed if sentence not in job.warnings]
-        job.write(pipe)
-    return job
+        log.warnings += [sentence for sentence in run.output.assumed if sentence not in log.warnings]
+        return write_pair(folder, run)

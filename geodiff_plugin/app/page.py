@@ -24,9 +24,9 @@ from geodiff_plugin._checks import InputError
 from geodiff_plugin.app import look, results
 from geodiff_plugin.app.form import EXAMPLES, QUICK, TAPS, Form, build_form
 from geodiff_plugin.app.job import Priors, Stopped, run_job
-from geodiff_plugin.cli.depth import Job
-from geodiff_plugin.cli.options import DepthOptions
-from geodiff_plugin.cli.outputs import depth_summary
+from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.jobs.records import PairResult
+from geodiff_plugin.jobs.report import depth_summary
 
 #: A visitor's uploads, result and files are deleted after this long, and when the tab is closed.
 FORGET_AFTER_S = 600
@@ -55,18 +55,18 @@ THEME = gr.themes.Base(
 )
 
 
-def _forget(job: Job | None) -> None:
+def _forget(job: PairResult | None) -> None:
     """Delete a result's files, and what it has in memory: gradio keeps the states of closed tabs a while."""
     if job is not None:
-        _delete([job.folder.path])
+        _delete([job.folder])
         for name in ("inputs", "output"):
-            vars(job).pop(name, None)
+            vars(job.run).pop(name, None)
         gc.collect()
         if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)):
             trim(0)  # else glibc keeps freed memory, more of it after every job
 
 
-def _kept(job: Job, ended: threading.Event) -> Job:
+def _kept(job: PairResult, ended: threading.Event) -> PairResult:
     """The job, unless its visitor stopped it or left during its last stage."""
     if ended.is_set():
         _forget(job)
@@ -105,12 +105,12 @@ def _sentence(error: Exception) -> str:
     return f"This is a defect, not your input: {type(error).__name__}."
 
 
-def _figures(job: Job) -> list[tuple[str, str]]:
+def _figures(job: PairResult) -> list[tuple[str, str]]:
     """Numbers for the banner; of a result that is not trusted only what is there, not how good it is."""
     visible, confidence = results.map_of(job, "visible"), results.map_of(job, "confidence")
     depth = depth_summary(results.depth_of(job), visible)
-    seconds = (f"{sum(job.watch.seconds.values()):.1f} s", "computing")
-    if not job.output.verdict.trusted:
+    seconds = (f"{sum(job.run.log.seconds.values()):.1f} s", "computing")
+    if not job.run.output.verdict.trusted:
         return [(f"{depth['median_m']:.2f} m, unconfirmed", "median depth"), seconds]
     figures = [
         (f"{depth['min_m']:.2f} m to {depth['max_m']:.2f} m", "nearest and farthest"),
@@ -123,20 +123,20 @@ def _figures(job: Job) -> list[tuple[str, str]]:
     return [*figures, seconds]
 
 
-def _cameras(job: Job) -> str:
+def _cameras(job: PairResult) -> str:
     """The cameras as understood."""
     (fx, _, cx), (_, fy, cy), _ = results.K_of(job)
-    x, y, z = apart = job.inputs.guidance.rigs[0].E[:3, 3]
+    x, y, z = apart = job.run.inputs.guidance.rigs[0].E[:3, 3]
     ways = {"right": x, "left": -x, "below": y, "above": -y, "before": z, "behind": -z}
     way, away = max(ways, key=lambda side: ways[side]), np.linalg.norm(apart)
     lens = f"fx {fx:.1f}, fy {fy:.1f}, cx {cx:.1f}, cy {cy:.1f} px"
     return f"Left camera: {lens}; the right one {away:.3g} m away, {way}."
 
 
-def _everything(panels: SimpleNamespace, job: Job, opened: str) -> dict[Any, Any]:
+def _everything(panels: SimpleNamespace, job: PairResult, opened: str) -> dict[Any, Any]:
     """Every panel's value for a new result; the cloud's only while its tab is open."""
-    verdict = job.output.verdict
-    sentences = dict.fromkeys([*verdict.reasons, *job.warnings])
+    verdict = job.run.output.verdict
+    sentences = dict.fromkeys([*verdict.reasons, *job.run.log.warnings])
     told = [for_visitors(sentence) for sentence in sentences if sentence != verdict.sentence]
     marked, words = results.measurement(job, [])
     sure = results.picture(job, "confidence")
@@ -157,9 +157,9 @@ def _everything(panels: SimpleNamespace, job: Job, opened: str) -> dict[Any, Any
     return shown
 
 
-def _scene(job: Job) -> tuple[Any, str]:
+def _scene(job: PairResult) -> tuple[Any, str]:
     """The view of the cloud of confident points from behind the cameras, and a line about it."""
-    path, depth_m = job.folder.path / results.SCENE, results.depth_of(job)
+    path, depth_m = job.folder / results.SCENE, results.depth_of(job)
     count = results.write_scene(path, job, LEAST_CONFIDENCE)
     share, away = 100 * count / depth_m.size, VIEW_FROM * float(np.percentile(depth_m, 90))
     view = gr.Model3D(str(path), camera_position=(*VIEW_ANGLES, away))
@@ -173,7 +173,7 @@ def _wire_run(
     fields, turn = list(form.fields.values()), threading.Lock()  # one job runs at a time
     # By session; a call over the API may have none.
     stops = defaultdict[str | None, threading.Event](threading.Event)
-    uploads, jobs = defaultdict[str | None, set[Path]](set), dict[str | None, Job]()
+    uploads, jobs = defaultdict[str | None, set[Path]](set), dict[str | None, PairResult]()
     fixed = (panels.tabs, panels.pixel, panels.add, panels.clear)
     shows = [component for component in vars(panels).values() if component not in fixed]
 
@@ -240,22 +240,22 @@ def _wire_run(
 
 
 def _wire_panels(panels: SimpleNamespace, state: gr.State, points: gr.State, tab: gr.State) -> None:
-    def redraw(job: Job | None, pixels: results.Pixels) -> tuple[Any, ...]:
+    def redraw(job: PairResult | None, pixels: results.Pixels) -> tuple[Any, ...]:
         if job is None:
             return gr.skip(), gr.skip(), gr.skip()
         return pixels, *results.measurement(job, pixels)
 
-    def click(job: Job | None, pixels: results.Pixels, event: gr.SelectData) -> tuple[Any, ...]:
+    def click(job: PairResult | None, pixels: results.Pixels, event: gr.SelectData) -> tuple[Any, ...]:
         return redraw(job, [*pixels, tuple(event.index)][-len(results.NAMES) :])
 
-    def add(job: Job | None, pixels: results.Pixels, typed: str) -> tuple[Any, ...]:
+    def add(job: PairResult | None, pixels: results.Pixels, typed: str) -> tuple[Any, ...]:
         numbers = [int(word) for word in re.findall(r"\d{1,6}", typed or "")]
         if job is None or len(numbers) != 2:
             return gr.skip(), gr.skip(), "Type two whole numbers: x, y." if job else gr.skip()
         x, y = (round(number * results.scale_of(job)) for number in numbers)
         return redraw(job, [*pixels, (x, y)][-len(results.NAMES) :])
 
-    def turn(job: Job | None, pixels: results.Pixels, event: gr.SelectData) -> dict[Any, Any]:
+    def turn(job: PairResult | None, pixels: results.Pixels, event: gr.SelectData) -> dict[Any, Any]:
         """What is made when its tab is opened."""
         shown: dict[Any, Any] = {tab: event.value}
         if job is not None and event.value == CLOUD_TAB:

@@ -15,10 +15,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.app import look
-from geodiff_plugin.cli.depth import Job
-from geodiff_plugin.cli.outputs import cameras_of, pixels_of, single_map
 from geodiff_plugin.formats import make_cloud, write_glb
 from geodiff_plugin.formats.out import REPORT
+from geodiff_plugin.jobs.records import PairResult
+from geodiff_plugin.jobs.report import single_map
+from geodiff_plugin.jobs.writing import cameras_of, pixels_of
 from geodiff_plugin.plotting import as_picture, colour_depth, colour_share, depth_range, ticks
 
 #: Pictures on the page are no larger than this; files to take home have every pixel.
@@ -114,31 +115,31 @@ def metres(value: float, spread: float | None = None) -> str:
     return f"{value:.{decimals}f}{'' if spread is None else f' ± {spread:.{decimals}f}'} m"
 
 
-def map_of(job: Job, name: str) -> np.ndarray | None:
+def map_of(job: PairResult, name: str) -> np.ndarray | None:
     """``(H, W)`` of a map of the output, or ``None``."""
-    value = getattr(job.output, name)
+    value = getattr(job.run.output, name)
     return None if value is None else single_map(value)
 
 
-def depth_of(job: Job) -> np.ndarray:
+def depth_of(job: PairResult) -> np.ndarray:
     """``(H, W)`` float32 metres."""
-    return single_map(job.output.prediction).astype(np.float32)
+    return single_map(job.run.output.prediction).astype(np.float32)
 
 
-def K_of(job: Job) -> np.ndarray:
+def K_of(job: PairResult) -> np.ndarray:
     """``(3, 3)`` pixels of the maps."""
-    return np.asarray(job.output.K)[0].astype(np.float64)
+    return np.asarray(job.run.output.K)[0].astype(np.float64)
 
 
-def scale_of(job: Job) -> float:
+def scale_of(job: PairResult) -> float:
     """Size of the pictures on the page / size of the maps."""
-    return min(1.0, LARGEST_SIDE / max(job.inputs.left.shape))
+    return min(1.0, LARGEST_SIDE / max(job.run.inputs.left.shape))
 
 
-def picture(job: Job, name: str) -> np.ndarray | None:
+def picture(job: PairResult, name: str) -> np.ndarray | None:
     """``(h, w, 3)`` uint8 of ``photograph``, ``depth`` or ``confidence``; ``None`` without such a map."""
     if name == "photograph":
-        full = np.asarray(as_picture(job.inputs.left))
+        full = np.asarray(as_picture(job.run.inputs.left))
     elif name == "depth":
         full = colour_depth(depth_of(job))
     else:
@@ -152,7 +153,7 @@ def picture(job: Job, name: str) -> np.ndarray | None:
     return np.asarray(Image.fromarray(full).resize(size, Image.Resampling.LANCZOS))
 
 
-def reading(job: Job, pixel: tuple[int, int]) -> Reading:
+def reading(job: PairResult, pixel: tuple[int, int]) -> Reading:
     """What the map says at a pixel of a picture on the page."""
     depth_m = depth_of(job)
     most = np.array(depth_m.shape[::-1]) - 1
@@ -187,7 +188,7 @@ def legend_of_confidence() -> str:
     return _legend(colours, marks, "Confidence: probability that a depth is within 10 % of the truth")
 
 
-def measurement(job: Job, pixels: Pixels) -> tuple[np.ndarray, str]:
+def measurement(job: PairResult, pixels: Pixels) -> tuple[np.ndarray, str]:
     """The photograph with the points of these pixels, and what they say as HTML; every two are a segment."""
     readings, photograph = [reading(job, pixel) for pixel in pixels], picture(job, "photograph")
     assert photograph is not None
@@ -253,22 +254,22 @@ def _write_readings(path: Path, readings: Sequence[Reading]) -> None:
             writer.writerow((f"{a} to {b}", *[""] * 5, spread, "", f"{length:.4f}"))
 
 
-def write_scene(path: Path, job: Job, least_confidence: float) -> int:
+def write_scene(path: Path, job: PairResult, least_confidence: float) -> int:
     """Cloud and cameras as GLB, light enough for a browser; how many points there are in all."""
-    cloud = make_cloud(*pixels_of(job.output, job.inputs.left, least_confidence))
-    write_glb(path, cloud.thinned(MOST_POINTS_SHOWN), cameras_of(job.output, job.inputs.guidance))
+    cloud = make_cloud(*pixels_of(job.run.output, job.run.inputs.left, least_confidence))
+    write_glb(path, cloud.thinned(MOST_POINTS_SHOWN), cameras_of(job.run.output, job.run.inputs.guidance))
     return len(cloud.points_m)
 
 
-def files_of(job: Job, pixels: Sequence[tuple[int, int]] = ()) -> list[Path]:
+def files_of(job: PairResult, pixels: Sequence[tuple[int, int]] = ()) -> list[Path]:
     """Everything that can be downloaded, first all in one, with ``measurements.csv`` of these pixels."""
-    folder = job.folder.path
+    folder = job.folder
     if pixels:
         _write_readings(folder / MEASUREMENTS, [reading(job, pixel) for pixel in pixels])
     else:
         (folder / MEASUREMENTS).unlink(missing_ok=True)
     report = (folder / REPORT).read_text(encoding="utf-8")
-    for path in (*job.options.photographs().values(), *job.options.calib):
+    for path in (*job.run.options.photographs().values(), *job.run.options.calib):
         report = report.replace(str(path), path.name)
     (folder / REPORT).write_text(report, encoding="utf-8")
     wanted = f"depth_mm.png depth.npy depth.png confidence.npy cloud.ply cloud.glb mesh.glb {REPORT}".split()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, replace
 from functools import partial
@@ -14,9 +15,8 @@ from typing import Annotated, Any
 import typer
 
 from geodiff_plugin.cli.commands import new_group
-from geodiff_plugin.cli.options import CaptureOptions, DepthOptions, start_pair
-from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, StopWatch
-from geodiff_plugin.formats.out import free_folder
+from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions, start_pair, with_folder
+from geodiff_plugin.jobs.telling import say, silent
 from geodiff_plugin.options import OUTPUT, SPACES, Command, PriorOptions, declare, help_of, imported
 
 _out = partial(declare, panel=OUTPUT)
@@ -35,40 +35,30 @@ def _later(where: str) -> Callable[[Any], None]:
     return lambda options: _imported(where)(**vars(options))
 
 
-def _with_folder(options: DepthOptions, default: str) -> DepthOptions:
-    """With the folder that was named, else the default, with a number where that is taken."""
-    if options.out is not None:
-        return options
-    return replace(options, out=Path(default) if options.overwrite else free_folder(Path(default)))
-
-
 def _depth(options: DepthOptions) -> None:
-    from geodiff_plugin.cli.pairs import is_many, start_many
     from geodiff_plugin.formats.recordings import is_bag
+    from geodiff_plugin.jobs.pairs import is_many, start_many
 
     if not is_bag(options.left):
         names = ("topic_left", "topic_right", "tolerance", "encoding")
         options.refuse(names, "left out where LEFT is not a bag", cure="It is for bags.")
     if is_bag(options.left):
-        failed = _imported("cli.many.run_bag")(options)
+        _imported("cli.run.run_bag")(options)
     elif is_many(options.left):
         options = replace(options, out=options.out or Path("geodiff-out"))
-        refs = start_many(options)
-        failed = _imported("cli.many.run_many")(options, refs)
+        refs = start_many(options, silent if options.quiet else say)
+        _imported("cli.run.run_many")(options, refs)
     else:
         cure = "Give folders, a list, videos or a bag."
         options.refuse(["steady"], "given with several pairs in order", "one pair", cure)
-        options, watch, failed = _with_folder(options, "geodiff-out"), StopWatch(), False
+        options = with_folder(options, "geodiff-out")
         with start_pair(options) as folder:
-            with watch.stage("start"):
-                run = _imported("cli.depth.run_depth")
-            run(options, folder, watch)
-    if failed:
-        sys.exit(EXIT_SOME_FAILED)
+            started = time.perf_counter()
+            _imported("cli.run.run_depth")(options, folder, started)
 
 
 def _capture(options: CaptureOptions) -> None:
-    _imported("cli.capture.run_capture")(options)
+    _imported("cli.run.run_capture")(options)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +71,7 @@ class _Demo:
         pair = Path(__file__).resolve().parents[1] / "bundled" / "pair"
         left, right, calib = (pair / name for name in ("left.png", "right.png", "calib.txt"))
         options = DepthOptions(left=left, right=right, calib=(calib,), device="cpu", **vars(self))
-        options = _with_folder(options, "geodiff-demo")
+        options = with_folder(options, "geodiff-demo")
         with start_pair(options) as folder:
             _imported("cli.demo.run_demo")(options, folder)
 
@@ -139,10 +129,10 @@ COMMANDS = {
     "demo": Command(_Demo, _Demo.run, "Run on a rendered pair of the package, and print how good it is."),
     "info": Command(_Info, _later("cli.info.run_info"), "Versions, devices, priors and what is cached."),
     "bench": Command(PriorOptions, _later("cli.demo.run_bench"), "What guidance costs in seconds."),
-    "video": Command(_Video, _later("cli.outputs.run_video"), "Join depth maps of a sequence into a video."),
-    "submit": Command(_Submit, _later("cli.outputs.run_submit"), "Write files for Middlebury and ETH3D."),
+    "video": Command(_Video, _later("cli.results.run_video"), "Join depth maps of a sequence into a video."),
+    "submit": Command(_Submit, _later("cli.results.run_submit"), "Write files for Middlebury and ETH3D."),
     "app": Command(_Page, _later("app.launch.run_app"), "Serve a web page to measure on (extra app)."),
-    "convert": Command(_Convert, _later("cli.convert.run_convert"), "Convert weights to a --prior folder."),
+    "convert": Command(_Convert, _later("cli.results.run_convert"), "Convert weights to a --prior folder."),
     "eval": Command(None, lambda _: _imported("cli.eval.eval_app"), "Measure it and others on data sets."),
 }
 ABOUT = "Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior."

@@ -13,7 +13,8 @@ import typer.main
 from typer.core import TyperGroup
 
 from geodiff_plugin._checks import InputError, bad_value
-from geodiff_plugin.cli.terminal import EXIT_BAD_INPUT, EXIT_INTERRUPTED, say
+from geodiff_plugin.cli.terminal import EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from geodiff_plugin.jobs.telling import say
 from geodiff_plugin.options import CAMERAS, OUTPUT, RUN, Command, check_options, flag_of
 
 APPEARANCE: dict[str, Any] = {

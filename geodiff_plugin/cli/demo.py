@@ -12,14 +12,16 @@ from functools import partial
 import torch
 
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
-from geodiff_plugin.cli.depth import estimate_and_write, load_guided_prior
-from geodiff_plugin.cli.options import DepthOptions
-from geodiff_plugin.cli.outputs import single_map, summary_line
-from geodiff_plugin.cli.terminal import StopWatch, new_table, say, show
+from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.evaluation.metrics import align, evaluate_depth
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.formats.out import OutFolder
+from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.jobs.pair import depth_pair
+from geodiff_plugin.jobs.prior import load_guided_prior, prior_of_options
+from geodiff_plugin.jobs.report import single_map, summary_line
+from geodiff_plugin.jobs.telling import collected_warnings, say, silent
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
 from geodiff_plugin.runtime.machine import pick_device, timed
 from geodiff_plugin.runtime.pipeline import guided_steps
@@ -31,11 +33,14 @@ CALLS = 3
 
 def run_demo(options: DepthOptions, out: OutFolder) -> None:
     """Write what ``geodiff depth`` writes and ``comparison.png``, and print how far it is from the truth."""
-    pipe, job, report = estimate_and_write(options, out, StopWatch())
+    tell = silent if options.quiet else say
+    with collected_warnings():
+        pipe = prior_of_options(options, pick_device(options.device), None if options.quiet else say)
+        result = depth_pair(options, pipe, folder=out, tell=tell, progress=not options.quiet)
     pair = read_demo_pair()
     plain = pipe(pair.left, generator=torch.Generator("cpu").manual_seed(options.seed))
     aligned_m = align(single_map(plain.prediction), pair.depth_m, pair.valid, pipe.config.prediction_type)
-    guided_m = single_map(job.output.prediction)
+    guided_m = single_map(result.run.output.prediction)
     table = new_table(("", "AbsRel", "delta1", "RMSE, m"))
     rows = {"prior, aligned by an oracle": aligned_m, "guided, metric as it comes": guided_m}
     for name, depth_m in rows.items():
@@ -50,7 +55,7 @@ def run_demo(options: DepthOptions, out: OutFolder) -> None:
             grid([pair.left, *maps], titles, cell_width=CELL_WIDTH).save(temporary, optimize=True)
     except OSError as error:  # the result itself is safe
         say(f"geodiff: comparison.png could not be written ({error.strerror or error}).")
-    print(summary_line(report, f"{out.path}/"))
+    print(summary_line(result.report, f"{out.path}/"))
     print(f"Open {out.path / 'comparison.png'} first: prior, guided depth and truth side by side.")
 
 

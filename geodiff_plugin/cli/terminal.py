@@ -1,65 +1,18 @@
-"""What the command says: lines on stderr, warnings as sentences, and tables that ``rich`` draws on stdout."""
+"""What the command answers on stdout: tables that ``rich`` draws, and exit codes."""
 
 from __future__ import annotations
 
 import sys
-import time
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # drawn by few commands
     from rich.console import RenderableType
     from rich.table import Table
 
 EXIT_BAD_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED = 2, 4, 130
-PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 #: Characters a line may have where nobody's terminal bounds it.
 UNBOUNDED = 10_000
-
-
-def say(line: str) -> None:
-    """Print one line on stderr, apart from the results on stdout, and above a progress bar."""
-    tqdm = sys.modules.get("tqdm")
-    if tqdm is None:
-        print(line, file=sys.stderr, flush=True)
-    else:
-        tqdm.tqdm.write(line, file=sys.stderr)
-        sys.stderr.flush()
-
-
-class StopWatch:
-    """Wall-clock seconds by stage, in the order of the stages."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Time what is inside."""
-        started = time.perf_counter()
-        yield
-        self.seconds[name] = time.perf_counter() - started
-
-
-@contextmanager
-def collected_warnings(tell: Callable[[str], None] = say) -> Iterator[None]:
-    """Tell every warning of this package once, as a line; those of others are shown as usual."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("always", category=UserWarning, module=r"geodiff_plugin")
-        shown_elsewhere, told = warnings.showwarning, set[str]()
-
-        def collect(message: Any, category: Any, filename: str, *rest: Any, **named: Any) -> None:
-            if PACKAGE_FOLDER not in Path(filename).resolve().parents:
-                shown_elsewhere(message, category, filename, *rest, **named)
-            elif str(message) not in told:
-                told.add(str(message))
-                tell(f"warning: {message}")
-
-        warnings.showwarning = collect
-        yield
 
 
 def show(*shown: RenderableType) -> None:

@@ -23,7 +23,7 @@ from geodiff_plugin.evaluation.experiment import Page, run_experiment
 from geodiff_plugin.evaluation.options import PosesOptions, TrustOptions
 from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs, headline, label_of
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.runner import Item, Record
+from geodiff_plugin.jobs.runner import Item, Record
 
 #: An error above this is of the kind that a wrong scale makes, and must be said.
 BY_A_FACTOR = 0.25

@@ -45,9 +45,9 @@ from geodiff_plugin.evaluation.tables import Table
 from geodiff_plugin.formats import write_depth_npy
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import write_text
+from geodiff_plugin.jobs.runner import Item, Journal, Record, Runner, fingerprint, this_process
 from geodiff_plugin.matching import match_volume
 from geodiff_plugin.result.confidence import RIGHT_WITHIN
-from geodiff_plugin.runner import Item, Journal, Record, Runner, fingerprint, this_process
 from geodiff_plugin.runtime.machine import PeakMemory, versions
 
 #: Journal of methods on samples, which several commands share.

@@ -22,7 +22,7 @@ from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.options import CAPTURE_ROWS, WAYS, CaptureEvalOptions, SequenceOptions
 from geodiff_plugin.evaluation.tables import CellOf, Table, grouped, mean_of, most_of, table_of_groups
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.runner import Item, Record, fingerprint
+from geodiff_plugin.jobs.runner import Item, Record, fingerprint
 
 #: What makes a sequence, by name; a checkout registers its renderer (tests/scenes/dataset.py).
 SEQUENCES: dict[str, Any] = {}

@@ -18,8 +18,8 @@ from geodiff_plugin.evaluation.datasets import SampleRef, select
 from geodiff_plugin.evaluation.experiment import Page
 from geodiff_plugin.evaluation.options import PairsOptions
 from geodiff_plugin.evaluation.tables import Table, cell, count_of_pairs, mean_cell, pairs_of
+from geodiff_plugin.jobs.runner import Item, Record, this_process
 from geodiff_plugin.priors import PRIORS, find_prior
-from geodiff_plugin.runner import Item, Record, this_process
 
 
 def pair_cells(refs: Sequence[SampleRef], methods: Sequence[str], options: PairsOptions) -> list[Item]:

@@ -29,8 +29,8 @@ from geodiff_plugin.evaluation.experiment import DENSE, Page, cell_key, in_metre
 from geodiff_plugin.evaluation.metrics import edge_error, evaluate_depth, filled, surface_error, to_space
 from geodiff_plugin.evaluation.options import STRENGTHS, StrengthOptions
 from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, method_title, most_of
+from geodiff_plugin.jobs.runner import Item, Record
 from geodiff_plugin.priors import prior_of
-from geodiff_plugin.runner import Item, Record
 from geodiff_plugin.runtime.noise_levels import noise_level
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from geodiff_plugin.evaluation.baselines import find_method
+from geodiff_plugin.jobs.runner import Record
 from geodiff_plugin.result.confidence import RIGHT_WITHIN
-from geodiff_plugin.runner import Record
 
 #: Below this number of images there is no interval: resampling four values says nothing.
 FEWEST_FOR_INTERVAL = 5

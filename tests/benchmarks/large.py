@@ -123,15 +123,14 @@ def measure_depth(folder: Path) -> dict[str, dict[str, float]]:
         ``stage -> {"seconds", "peak_mb"}``, of the whole process, in the order of the stages; ``"start"`` is
         the process with its libraries.
     """
-    from geodiff_plugin.cli.depth import estimate_and_write
-    from geodiff_plugin.cli.options import DepthOptions, start_pair
-    from geodiff_plugin.cli.terminal import StopWatch
+    from geodiff_plugin.jobs.options import DepthOptions, start_pair
+    from geodiff_plugin.jobs.pair import depth_pair
 
     names = {name: folder / f"{name}.png" for name in ("left", "right")}
     out, samples = folder / "out", [(time.perf_counter(), psutil.Process().memory_info().rss)]
     options = DepthOptions(**names, calib=(folder / "calib.txt",), out=out, device="cpu", quiet=True)
     with _sampled(samples), start_pair(options) as held:
-        stages = estimate_and_write(options, held, StopWatch())[2]["seconds"]
+        stages = depth_pair(options, folder=held).report["seconds"]
     # The stages follow each other and the last one ends where sampling ends.
     found, end = {}, samples[-1][0]
     for name, seconds in reversed(stages.items()):

@@ -20,12 +20,12 @@ import numpy as np
 import torch
 from PIL import Image
 
-from geodiff_plugin.cli.depth import load_guided_prior
-from geodiff_plugin.cli.many import Stages
-from geodiff_plugin.cli.options import DepthOptions
-from geodiff_plugin.cli.pairs import start_many
 from geodiff_plugin.cli.terminal import new_table, show
-from geodiff_plugin.runner import Item, Journal, Runner
+from geodiff_plugin.jobs.many import Stages
+from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.jobs.pairs import start_many
+from geodiff_plugin.jobs.prior import load_guided_prior
+from geodiff_plugin.jobs.runner import Item, Journal, Runner
 from geodiff_plugin.runtime.machine import pick_device
 from tests.scenes import render_pair
 

@@ -117,7 +117,7 @@ def run(words):
 
 @pytest.mark.parametrize("typed", MESSAGES)
 def test_bad_input(typed, geodiff, pair_files, monkeypatch):
-    monkeypatch.setattr("geodiff_plugin.cli.depth.find_prior", never)
+    monkeypatch.setattr("geodiff_plugin.jobs.prior.find_prior", never)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     write_files()
     before = sorted(pair_files.folder.rglob("*"))
@@ -158,8 +158,8 @@ def test_what_needs_no_torch_is_said_without_it(pair_files):
 def test_names_that_are_known_without_torch_are_those_with_it():
     import torch
 
-    from geodiff_plugin.cli.outputs import BENCHMARKS
     from geodiff_plugin.config import PRESETS as CONFIGS
+    from geodiff_plugin.jobs.results import BENCHMARKS
     from geodiff_plugin.scale import space
 
     assert set(SPACES) == set(space.SPACES) and set(PRESETS) <= set(CONFIGS)

@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.cli.inputs import lenses_of, read_inputs
-from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats.images import distortion_from_text
+from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.jobs.reading import lenses_of, read_pair
 from geodiff_plugin.types import Rig
 from tests.cli.conftest import report_of
 from tests.scenes import render_pair
@@ -60,7 +60,7 @@ def estimate(geodiff, photographs, prior, tmp_path, monkeypatch):
 
 def test_a_pair_from_a_phone(estimate, pair):
     baseline = float(np.linalg.norm(pair.E.numpy()[:3, 3]))
-    answer, report = estimate("--baseline", baseline, "-q")
+    answer, report = estimate("--baseline", baseline)
     assert "35 mm equivalent by its EXIF" in answer.err
     found = report["estimated_pose"]
     assert found["inliers"][0] > 50 and found["parallax_deg"][0] > 1 and found["residual_px"][0] < 1
@@ -142,7 +142,7 @@ def test_the_estimation_of_poses_is_told_what_it_needs(pair_files, monkeypatch):
     for distortion in ((), ("0.2,0,0,0",)):
         options = DepthOptions(**VIEWS, device="cpu", estimate_pose=True, distortion=distortion, **known)
         with pytest.raises(InterruptedError):
-            read_inputs(options)
+            read_pair(options)
         assert told["cropped"] is True
         if not distortion:
             assert told["points"].shape == (48, 64) and told["points"][12, 10] == 2.0

@@ -13,9 +13,9 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin.cli import many
-from geodiff_plugin.cli.options import DepthOptions
-from geodiff_plugin.cli.pairs import find_pairs
+from geodiff_plugin.jobs import many
+from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.jobs.pairs import find_pairs
 from tests.cli.conftest import QUICK, call, never, report_of, write_pair
 
 COMMAND = ["depth", "left", "right", "--calib", "calib.txt", "--prior", "prior", "--out", "out", *QUICK]
@@ -73,18 +73,19 @@ def contents(folder: Path) -> dict[Path, bytes]:
 # Which pairs
 
 
-def test_folders_go_by_name_else_by_order_in_which_numbers_count(tmp_path, textured_plane, capsys):
+def test_folders_go_by_name_else_by_order_in_which_numbers_count(tmp_path, textured_plane):
     write_folders(tmp_path, textured_plane, ["f10", "f1", "f2"])
     left, right = tmp_path / "left", tmp_path / "right"
     (left / "notes.md").write_text("no picture")
     options = DepthOptions(left=left, right=right)
-    assert [ref.name for ref in find_pairs(options)] == ["f1", "f2", "f10"]
-    assert capsys.readouterr().err == ""
+    told = []
+    assert [ref.name for ref in find_pairs(options, told.append)] == ["f1", "f2", "f10"]
+    assert told == []
     for path in right.iterdir():
         path.rename(path.with_stem(f"{path.stem}_R"))
-    names = [ref.right.name for ref in find_pairs(options)]
+    names = [ref.right.name for ref in find_pairs(options, told.append)]
     assert names == ["f1_R.png", "f2_R.png", "f10_R.png"]
-    assert "in order: f1.png with f1_R.png to f10.png with f10_R.png." in capsys.readouterr().err
+    assert "in order: f1.png with f1_R.png to f10.png with f10_R.png." in told[0]
 
 
 def test_lists_by_comma_or_tab(tmp_path):
@@ -155,14 +156,14 @@ def test_a_finished_pair_is_judged_with_strict(geodiff, finished):
 
 
 def test_a_broken_pair_and_a_defect_are_reported_and_the_rest_go_on(geodiff, fresh, monkeypatch):
-    write = many.Job.write
+    write = many.write_pair
 
-    def broken(job, *rest, **entries):
-        if job.folder.path.name == "a":
+    def broken(folder, run, **entries):
+        if folder.path.name == "a":
             raise KeyError("nobody thought of this")
-        return write(job, *rest, **entries)
+        return write(folder, run, **entries)
 
-    monkeypatch.setattr(many.Job, "write", broken)
+    monkeypatch.setattr(many, "write_pair", broken)
     image = fresh / "right" / "b.png"
     image.write_bytes(image.read_bytes()[:1000])
     answer = geodiff(*COMMAND)
@@ -174,7 +175,7 @@ def test_a_broken_pair_and_a_defect_are_reported_and_the_rest_go_on(geodiff, fre
 
 
 def test_what_fails_all_pairs_is_said_once_before_the_prior_is_loaded(geodiff, fresh, monkeypatch):
-    monkeypatch.setattr(many, "load_guided_prior", never)
+    monkeypatch.setattr(many, "prior_of_options", never)
     for path in (fresh / "right").iterdir():
         path.write_bytes(path.read_bytes()[:60])
     answer = geodiff(*COMMAND)
@@ -199,19 +200,19 @@ def test_a_list_with_a_calibration_each_and_maps_of_another_model(geodiff, fresh
 
 
 def test_a_full_disk_ends_the_run_and_keeps_what_is_finished(geodiff, fresh, monkeypatch):
-    write = many.Job.write
+    write = many.write_pair
 
-    def full(job, pipe):
-        if job.options.out.name == "b":
+    def full(folder, run, **entries):
+        if folder.path.name == "b":
             raise OSError(errno.EDQUOT, "Disk quota exceeded")
-        return write(job, pipe)
+        return write(folder, run, **entries)
 
-    monkeypatch.setattr(many.Job, "write", full)
+    monkeypatch.setattr(many, "write_pair", full)
     answer = geodiff(*COMMAND)
     assert answer.code == 2 and answer.err.count("exceeded") == 1
     assert "is full (Disk quota exceeded). Finished pairs stay; the same command goes on" in answer.err
     assert Path("out/a/report.json").exists() and not Path("out/b").exists()
-    monkeypatch.setattr(many.Job, "write", write)
+    monkeypatch.setattr(many, "write_pair", write)
     answer = geodiff(*COMMAND)
     assert answer.code == 0 and "0 failed" in answer.out and "0 there" not in answer.out
 

@@ -24,9 +24,9 @@ from transformers import (
 )
 
 from examples.marigold_v2 import tiny_marigold_v2
-from geodiff_plugin.cli.convert import unet_config
 from geodiff_plugin.priors import load_prior
 from geodiff_plugin.priors.components import DirectScheduler, FixedPrompt
+from geodiff_plugin.priors.convert import unet_config
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
 from geodiff_plugin.priors.geowizard import IMAGE_EMBEDDING, TEXT_PROMPT, GeoWizardPipeline

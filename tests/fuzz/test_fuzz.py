@@ -17,11 +17,11 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.cli.pairs import is_many
 from geodiff_plugin.config import KNOBS
 from geodiff_plugin.formats import as_image_01, read_calibration, read_image, read_matrix, read_points
 from geodiff_plugin.formats.images import warn_of_other_lens
 from geodiff_plugin.formats.out import check_out
+from geodiff_plugin.jobs.pairs import is_many
 from tests.contracts.calibrations import SAMPLES, choice, written
 
 COMMON: dict[str, Any] = {

@@ -9,7 +9,7 @@ from diffusers import AutoencoderKLQwenImage, QwenImageTransformer2DModel
 from diffusers.models.autoencoders import vae as vae_module
 from safetensors.torch import save_file
 
-from geodiff_plugin.cli.convert import run_convert
+from geodiff_plugin.cli.results import run_convert
 from geodiff_plugin.priors import find_prior
 from tests.parity import marigold_v2_reference as reference
 

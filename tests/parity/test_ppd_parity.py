@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from safetensors.torch import save_file
 
-from geodiff_plugin.cli.convert import run_convert
+from geodiff_plugin.cli.results import run_convert
 from geodiff_plugin.priors import find_prior
 from geodiff_plugin.priors.ppd import AreaImageProcessor, PixelDiT, sampling_timesteps, semantic_tokens
 from tests.parity import ppd_reference as reference

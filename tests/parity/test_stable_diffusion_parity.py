@@ -12,7 +12,7 @@ from diffusers.models.autoencoders import vae as vae_module
 from PIL import Image
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from geodiff_plugin.cli.convert import run_convert
+from geodiff_plugin.cli.results import run_convert
 from geodiff_plugin.priors import find_prior
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet

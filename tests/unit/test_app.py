@@ -147,7 +147,7 @@ def test_a_job_and_its_files(result):
     report = json.loads((folder / "report.json").read_text())
     assert report["inputs"]["E"][0][3] == pytest.approx(0.12) and report["arguments"]["left"] == "left.png"
     assert report["arguments"]["ensemble"] == 2 and "cx is assumed" in " ".join(report["warnings"])
-    assert report["verdict"]["status"] == result.output.verdict.status
+    assert report["verdict"]["status"] == result.run.output.verdict.status
     pixels = [(5, 5), (50, 40), (20, 20)]
     with ZipFile(results.files_of(result, pixels)[0]) as archive:  # which does not hold itself
         assert sorted(archive.namelist()) == sorted([*names[1:], "measurements.csv"])
@@ -262,10 +262,10 @@ class TestWithGradio:
     def test_a_forgotten_result_leaves_no_files_and_no_maps(self, tmp_path):
         from geodiff_plugin.app.page import _forget
 
-        result = SimpleNamespace(folder=SimpleNamespace(path=tmp_path), inputs=[], output=[])
+        result = SimpleNamespace(folder=tmp_path, run=SimpleNamespace(inputs=[], output=[]))
         for _ in range(2):  # when the tab is closed, and by gradio later
             _forget(result)
-        assert not tmp_path.exists() and list(vars(result)) == ["folder"]
+        assert not tmp_path.exists() and not vars(result.run)
 
     def test_a_port_that_another_program_has_is_a_sentence(self, monkeypatch):
         def taken(*_args, **_options):

@@ -17,12 +17,13 @@ from geodiff_plugin import Capture, InputError
 from geodiff_plugin.capture.agreement import DepthFrame, agreed
 from geodiff_plugin.capture.capture import choose_neighbours
 from geodiff_plugin.capture.results import fuse, write_map, write_mesh
-from geodiff_plugin.cli import capture as run
-from geodiff_plugin.cli.options import CaptureOptions
+from geodiff_plugin.cli.run import run_capture, summary
 from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.frames import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
+from geodiff_plugin.jobs import capture as run
+from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.plotting import grid
 from geodiff_plugin.pose.capture import SolvedCapture, candidate_pairs, solve_capture
 from geodiff_plugin.result.verdict import Indicators, judge
@@ -276,16 +277,16 @@ WAYS.append({"distance": f"f01,f08,{np.linalg.norm(TRUE[8, :3, 3] - TRUE[1, :3, 
 @pytest.mark.parametrize("way", WAYS, ids=lambda way: next(iter(way), "none"))
 def test_one_length_gives_all_and_without_one_nothing_says_metres(way, model, tmp_path, monkeypatch, capsys):
     options = model(**way)
-    report = run.capture_report(options)
+    report = run.depth_capture(options)
     truth, depth = render(TRUE[4])[1], np.load(tmp_path / "out/f04/depth.npy")
     assert np.median(depth / truth) == pytest.approx(1 if way else 0.5, rel=0.02)
     cloud = (tmp_path / "out/cloud.ply").read_bytes()[:200].decode("latin1")
-    texts = [run.summary(report, options.out), cloud, capsys.readouterr().err]
+    texts = [summary(report, options.out), cloud, capsys.readouterr().err]
     assert any(" m " in text or "metres" in text for text in texts) is bool(way)
     assert report["unit"] == json.loads((tmp_path / "out/f04/report.json").read_text())["unit"]
     assert report["unit"] == ("m" if way else None)
     monkeypatch.setattr(run, "write_maps", lambda *_: pytest.fail("done before"))
-    again = run.capture_report(replace(options, overwrite=False))
+    again = run.depth_capture(replace(options, overwrite=False))
     assert [frame["frame"] for frame in again["frames"]] == ["f02", "f04", "f06"]
     (tmp_path / "out/poses.npz").write_bytes(b"torn")
     assert run.load_solved(tmp_path / "out/poses.npz", "") is None
@@ -309,13 +310,13 @@ def test_frames_that_are_not_trusted_are_named_and_marked(model, monkeypatch):
     monkeypatch.setattr(run, "_write_frame", doubting)
     monkeypatch.setattr("geodiff_plugin.capture.results.fuse", fusing)
     monkeypatch.setattr("geodiff_plugin.plotting.grid", noting)
-    report = run.capture_report(options)
+    report = run.depth_capture(options)
     assert report["not_trusted"] == ["f04"]
-    assert "; NOT TRUSTED: f04 (f04: Blurred.) -> " in run.summary(report, options.out)
+    assert "; NOT TRUSTED: f04 (f04: Blurred.) -> " in summary(report, options.out)
     assert lowest == [0, 1, 0]  # seen by no other frame; of a doubted one that is no excuse
     assert titles == ["f02", "depth", "f04", "depth, not trusted", "f06", "depth"]
     with pytest.raises(SystemExit):
-        run.run_capture(replace(options, strict=True))
+        run_capture(replace(options, strict=True))
 
 
 def test_a_frame_that_fails_is_named_and_the_rest_is_kept(model, tmp_path, monkeypatch, capsys):
@@ -328,12 +329,12 @@ def test_a_frame_that_fails_is_named_and_the_rest_is_kept(model, tmp_path, monke
 
     monkeypatch.setattr(run, "_depth", failing)
     with pytest.raises(SystemExit) as leaving:
-        run.run_capture(options)
+        run_capture(options)
     assert leaving.value.code == EXIT_SOME_FAILED and "2 of 3 frames" in capsys.readouterr().out
     report = json.loads((tmp_path / "out/capture.json").read_text())
     assert "f04 is blank." in report["frames"][1]["error"] and not (tmp_path / "out/f04").exists()
     monkeypatch.setattr(run, "_depth", depth)
-    run.run_capture(replace(options, overwrite=False))
+    run_capture(replace(options, overwrite=False))
     assert (tmp_path / "out/f04/depth.npy").is_file()
 
 

@@ -8,10 +8,10 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GuidanceConfig
-from geodiff_plugin.cli.inputs import pinhole
 from geodiff_plugin.evidence.inputs import Inputs
 from geodiff_plugin.evidence.prepare import make_evidence
 from geodiff_plugin.formats.images import distortion_from_text, undistorted
+from geodiff_plugin.jobs.reading import pinhole
 from geodiff_plugin.matching import build_cost_volume, clean, match_volume
 from geodiff_plugin.matching.cleaning import find_flaws
 from geodiff_plugin.types import CameraView

@@ -11,9 +11,9 @@ import pytest
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.cli.inputs import read_rig
-from geodiff_plugin.cli.options import DepthOptions
 from geodiff_plugin.formats import read_calibration
+from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.jobs.reading import read_rig
 from tests.contracts.calibrations import NAMES, SAMPLES, choice, read_texts, rigid, written
 
 ZED_HD = {"image_size": (1280, 720)}

@@ -13,12 +13,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from geodiff_plugin.runner import BROKEN, Item, Journal, Runner, fingerprint
+from geodiff_plugin.jobs.runner import BROKEN, Item, Journal, Runner, fingerprint
 
 CHILD = """
 import sys, time
 from pathlib import Path
-from geodiff_plugin.runner import Item, Journal, Runner
+from geodiff_plugin.jobs.runner import Item, Journal, Runner
 
 out, pause, stages = Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
 

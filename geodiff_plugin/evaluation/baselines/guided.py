@@ -20,10 +20,10 @@ from geodiff_plugin.config import FAST, PAPER, PRIOR_FIT, GuidanceConfig, config
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.prepare import EvidenceStore
+from geodiff_plugin.jobs.runner import fingerprint
 from geodiff_plugin.priors import load_prior, prior_of
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.map import DepthMapPipeline
-from geodiff_plugin.runner import fingerprint
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.scale.space import SPACES
 

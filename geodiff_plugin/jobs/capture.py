@@ -1,4 +1,4 @@
-"""``geodiff capture``: poses once, depth of every chosen frame, agreement, one cloud of all."""
+"""A capture: poses once, depth of every chosen frame, agreement, one cloud of all."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 import math
 import multiprocessing
 import os
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
@@ -20,20 +19,20 @@ import psutil  # comes with accelerate
 import torch
 
 from geodiff_plugin import __version__
-from geodiff_plugin._checks import InputError, bad_value, check_positive
+from geodiff_plugin._checks import InputError, bad_value, check_positive, warn
 from geodiff_plugin._threads import WithinCores, available_cores
 from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.capture.results import ALONE, save_alone, write_agreement, write_results
-from geodiff_plugin.cli.depth import load_guided_prior
-from geodiff_plugin.cli.options import OF_SCALE, CaptureOptions
-from geodiff_plugin.cli.outputs import plain, single_map, verdict_report, write_maps
-from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, collected_warnings, say
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
 from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, check_new, write_text
+from geodiff_plugin.jobs.options import OF_SCALE, CaptureOptions
+from geodiff_plugin.jobs.prior import load_guided_prior
+from geodiff_plugin.jobs.report import plain, single_map, verdict_report
+from geodiff_plugin.jobs.runner import BROKEN, Item, Journal, Runner, fingerprint, this_process
+from geodiff_plugin.jobs.telling import Tell, collected_warnings, say, silent
+from geodiff_plugin.jobs.writing import write_maps
 from geodiff_plugin.pose.capture import SolvedCapture
-from geodiff_plugin.result.verdict import UNTESTED
-from geodiff_plugin.runner import BROKEN, Item, Journal, Runner, fingerprint, this_process
 from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.types import MetricDepthOutput
 
@@ -202,7 +201,7 @@ def _write_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[],
 
 
 def _run_frames(
-    capture: Capture, options: CaptureOptions, names: Sequence[str], factor: float | None
+    capture: Capture, options: CaptureOptions, names: Sequence[str], factor: float | None, progress: bool
 ) -> list[Record]:
     """Depth of every chosen frame that is not done yet, by one process a core; their reports in order."""
     if options.overwrite and this_process().index == 0:  # the journal of all processes
@@ -221,21 +220,23 @@ def _run_frames(
         more.append(multiprocessing.get_context("spawn").Process(target=_help, args=arguments, daemon=True))
         more[-1].start()
     try:
-        return _work(capture, options, items, count)
+        return _work(capture, options, items, count, progress)
     finally:
         for process in more:
             process.terminate()
             process.join()
 
 
-def _work(capture: Capture, options: CaptureOptions, items: Sequence[Item], count: int) -> list[Record]:
+def _work(
+    capture: Capture, options: CaptureOptions, items: Sequence[Item], count: int, progress: bool = False
+) -> list[Record]:
     """The part of the frames of one of ``count`` processes."""
     runner = Runner(
         items,
         Journal(options.out / JOURNAL),
         noun="frame",
         survives=(InputError, OSError, ValueError, RuntimeError),
-        progress=not options.quiet,
+        progress=progress,
         whole=lambda item, _: all((options.out / item.key / f"{file}.npy").is_file() for file in ALONE),
     )
     with WithinCores(count):
@@ -245,31 +246,42 @@ def _work(capture: Capture, options: CaptureOptions, items: Sequence[Item], coun
 def _help(options: CaptureOptions, items: list[Item], factor: float | None, index: int, count: int) -> None:
     """Another process of the same run, which takes frames that nobody has taken."""
     os.environ.update(RANK=str(index), WORLD_SIZE=str(count), LOCAL_RANK="0")
-    options = replace(options, overwrite=False, quiet=True)
-    with collected_warnings(lambda _: None):  # the first process has told them
+    options = replace(options, overwrite=False)
+    with collected_warnings(silent):  # the first process has told them
         capture = open_capture(options)
         solved_poses(capture, options, factor)
-    with collected_warnings():
+    with collected_warnings(say):
         _work(capture, options, items, count)
 
 
-def capture_report(options: CaptureOptions) -> Record:
-    """Everything of the command but its answer on stdout: poses, frames, and the report, ``capture.json``."""
+def depth_capture(options: CaptureOptions, *, tell: Tell = silent, progress: bool = False) -> Record:
+    """What ``geodiff capture`` does: poses, frames, their agreement and one cloud, into ``options.out``.
+
+    Args:
+        options: of the command.
+        tell: takes the lines for the user.
+        progress: whether a bar on stderr counts the frames.
+
+    Returns:
+        The content of ``capture.json``; ``failed`` and ``not_trusted`` name frames.
+
+    Raises:
+        InputError: no capture, options that do not fit it, or no frame that got depth.
+    """
     started = time.perf_counter()
     capture = open_capture(options)
     names = capture.choose(options.frames)
     for note in capture.notes:
-        say(note)
+        tell(note)
     ours = any((options.out / name).is_file() for name in (POSES_FILE, JOURNAL))
     check_new(options.out, ours or options.overwrite).mkdir(parents=True, exist_ok=True)
     factor = solved_poses(capture, options)
     seconds = {"poses": round(time.perf_counter() - started, 1)}
     solved = capture.solve()
-    if not options.quiet:
-        say(f"poses {solved.status}: matches lie {solved.residual_px:.2f} px off their epipolar lines")
+    tell(f"poses {solved.status}: matches lie {solved.residual_px:.2f} px off their epipolar lines")
     for note in solved.notes:
-        say(f"warning: {note}")
-    frames = _run_frames(capture, options, names, factor)
+        warn(note)
+    frames = _run_frames(capture, options, names, factor, progress)
     seconds["frames"] = round(time.perf_counter() - started - seconds["poses"], 1)
     failed = [report["key"] for report in frames if report.get("status") == BROKEN]
     done = [name for name in names if name not in failed]
@@ -315,26 +327,3 @@ def _pose_report(capture: Capture) -> Record:
         if math.isfinite(m)
     }
     return {"status": solved.status, **rounded, "notes": list(solved.notes), "frames": frames}
-
-
-def run_capture(options: CaptureOptions) -> None:
-    """Depth of every frame, the answer on stdout; ends with ``EXIT_SOME_FAILED`` where a frame failed."""
-    with collected_warnings():
-        report = capture_report(options)
-    print(json.dumps(report, indent=2) if options.json else summary(report, options.out))
-    if report["failed"] or (options.strict and report["not_trusted"]):
-        sys.exit(EXIT_SOME_FAILED)
-
-
-def summary(report: Record, out: Path) -> str:
-    """One line for people."""
-    depths = sorted(frame["depth"]["median"] for frame in report["frames"] if "error" not in frame)
-    line = f"{len(depths)} of {len(report['frames'])} frames"
-    if depths:
-        unit = "m" if report["unit"] else "units of the poses"
-        line += f", median depth {depths[len(depths) // 2]:.2f} {unit}"
-    if doubted := report["not_trusted"]:
-        line += f"; NOT TRUSTED: {', '.join(doubted[:9])}{' ...' if doubted[9:] else ''}"
-        reasons = next(f["verdict"]["reasons"] for f in report["frames"] if f["frame"] == doubted[0])
-        line += f" ({doubted[0]}: {' '.join(reasons[:1]) or UNTESTED})"
-    return f"{line} -> {out}/"

@@ -11,11 +11,11 @@ from pathlib import Path
 from PIL import Image
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.cli.options import DepthOptions, check_files, told_apart
-from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.formats.files import MAP_SUFFIXES, check_file, find_map, natural_order
 from geodiff_plugin.formats.out import check_out
 from geodiff_plugin.formats.recordings import VIDEOS, is_bag, is_video, list_pairs, video_facts
+from geodiff_plugin.jobs.options import DepthOptions, check_files, told_apart
+from geodiff_plugin.jobs.telling import Tell, silent
 
 #: The table of a run, and its columns.
 SUMMARY = "pairs.csv"
@@ -42,11 +42,14 @@ def is_many(left: Path) -> bool:
     return os.path.isdir(left) or left.suffix.lower() in LISTS or is_video(left)
 
 
-def start_many(options: DepthOptions) -> list[PairRef]:
-    """Find the pairs of a run over many, and make all checks that need neither images nor torch."""
+def start_many(options: DepthOptions, tell: Tell = silent) -> list[PairRef]:
+    """Find the pairs of a run over many, and make all checks that need neither images nor torch.
+
+    ``options.left`` is a folder, a list, a video or a bag; ``tell`` hears how pairs were assumed to belong.
+    """
     names = ("points", "disparity", "view", "known_length")
     options.refuse(names, "left out with many pairs", cure="It belongs to one pair.")
-    refs = find_pairs(options)
+    refs = find_pairs(options, tell)
     each = [options_of(ref, options) for ref in refs]  # every pair has its map
     if refs[0].frame is not None:
         cure = "Extract some frames, and try it there."
@@ -69,7 +72,7 @@ def start_many(options: DepthOptions) -> list[PairRef]:
     return refs
 
 
-def find_pairs(options: DepthOptions) -> list[PairRef]:
+def find_pairs(options: DepthOptions, tell: Tell = silent) -> list[PairRef]:
     """The pairs of a run, in order."""
     left, right = options.left, options.right
     if is_bag(left):
@@ -77,8 +80,8 @@ def find_pairs(options: DepthOptions) -> list[PairRef]:
     if not os.path.isdir(left) and not is_video(left):
         return _of_list(left, right)
     refs, assumed = (_of_folders if os.path.isdir(left) else _of_videos)(left, right)
-    if assumed and not options.quiet:
-        say(f"assumed: {assumed}")
+    if assumed:
+        tell(f"assumed: {assumed}")
     return refs
 
 

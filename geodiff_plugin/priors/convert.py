@@ -1,4 +1,4 @@
-"""``geodiff convert``: weights in their authors' format to a folder for ``--prior``."""
+"""Weights in their authors' format, made into a folder that ``load_prior`` takes (``geodiff convert``)."""
 
 from __future__ import annotations
 
@@ -74,8 +74,17 @@ FOLDERS = {"Diffuser": "transformer", "VAE": "vae"}
 NAMES = ((r"\.base_layer\.", "."), (r"\.lora_([AB])(\.default)?\.weight$", r".weight \1"))
 
 
-def run_convert(paths: Sequence[Path], part: str | None = None, space: str | None = None) -> None:
-    """Convert and say where it is; ``part`` is the file, folder or hub id of what the checkpoint lacks."""
+def convert_prior(paths: Sequence[Path], part: str | None = None, space: str | None = None) -> str:
+    """Convert a checkpoint into a folder that appears whole or not at all; the kind that it was.
+
+    Args:
+        paths: ``SRC DST``, or ``marigold-v2 BASE CHECKPOINT DST``.
+        part: the file, folder or hub id of what the checkpoint lacks.
+        space: what the map of ``marigold-v2`` is affine in, where its folder's name does not say.
+
+    Raises:
+        InputError: no checkpoint of a known kind, or a ``DST`` that exists.
+    """
     layered = len(paths) == 4 and str(paths[0]) == MARIGOLD_V2
     if not layered and len(paths) != 2:
         expected = f"SRC DST, or {MARIGOLD_V2} BASE CHECKPOINT DST"
@@ -105,7 +114,7 @@ def run_convert(paths: Sequence[Path], part: str | None = None, space: str | Non
         bad_value("SRC", "a whole checkpoint of its kind", f"{source} ({reason})", "Fetch it anew.")
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
-    print(f"{source} ({kind}) -> {target}; use it with --prior {target}")
+    return kind
 
 
 def _read_checkpoint(path: Path, kind: type[Any] = Mapping) -> Any:

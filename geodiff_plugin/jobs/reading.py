@@ -1,4 +1,4 @@
-"""Reads the files of ``geodiff depth`` into images, cameras and a guidance (S3.3), before weights load."""
+"""The files of one pair, read into images, cameras and a guidance (S3.3), before weights load."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ from geodiff_plugin._camera_checks import (
     check_pose,
 )
 from geodiff_plugin._checks import bad_value, warn
-from geodiff_plugin.cli.options import PARAMETERS, DepthOptions
-from geodiff_plugin.cli.terminal import say
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.guidance import GeometryGuidance, assume_same_centre
 from geodiff_plugin.evidence.prepare import cleaned
@@ -34,16 +32,19 @@ from geodiff_plugin.formats.images import (
     warn_of_other_lens,
 )
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
+from geodiff_plugin.formats.sfm import check_colmap_names
+from geodiff_plugin.jobs.options import PARAMETERS, DepthOptions, told_apart
 from geodiff_plugin.types import Distortion, Rig
 
 Size = tuple[int, int]
 
 
-@dataclass(frozen=True)
-class Inputs:
+@dataclass(frozen=True, eq=False)
+class PairInputs:
     """The left view ``(H, W, 3)`` in [0, 1], the cameras of both, and the guidance, with all other views.
 
-    ``undistorted`` says whether lens distortion was taken out; ``prior_map`` is ``(h, w)``, NaN unknown.
+    ``undistorted`` says whether lens distortion was taken out; ``prior_map`` is ``(h, w)``, NaN unknown;
+    ``notes`` are for the user, such as the focal length that EXIF gave.
     """
 
     left: np.ndarray
@@ -51,54 +52,97 @@ class Inputs:
     guidance: GeometryGuidance
     undistorted: bool = False
     prior_map: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
 
 
-def read_inputs(
+@dataclass(frozen=True, eq=False)
+class _Cameras:
+    """K ``(3, 3)`` of every view, left one first, and where they are not estimated the rig and the poses."""
+
+    Ks: list[np.ndarray]
+    rig: Rig | None = None
+    poses: tuple[np.ndarray, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def read_pair(
     options: DepthOptions, frames: Sequence[np.ndarray] | None = None, names: tuple[str, str] | None = None
-) -> Inputs:
+) -> PairInputs:
     """Read images and cameras of checked options, and see that they fit each other.
 
-    Views that are no files are given as ``frames``, left and right, ``(H, W, 3)`` float32 in [0, 1].
+    Args:
+        options: which files, and how the cameras are given.
+        frames: views that are no files, left and right, ``(H, W, 3)`` float32 in [0, 1].
+        names: of the left and the right image in the calibration, where they are not those of the files.
+
+    Raises:
+        InputError: a file that cannot be read, or cameras that do not fit the images.
     """
     views, config = options.photographs(), options.config()
     images = list(frames or map(_read_view, views.values(), views))
     sizes = [(image.shape[1], image.shape[0]) for image in images]
-    way, rig, poses = options.cameras_way(), None, []
     if options.estimate_pose:
-        Ks = [_intrinsics(options, way, path, i, sizes[i]) for i, path in enumerate(views.values())]
+        cameras = _cameras_without_poses(options, sizes)
     else:
-        rig = read_rig(options, sizes[0], sizes[1] if len(sizes) > 1 else None, names)
-        if frames is None:
-            for K, (name, path) in zip((rig.K_left, rig.K_right), list(views.items())[:2], strict=False):
-                warn_of_other_lens(path, K, name)
-        further = [_matrix(path, "--view-K") for path in options.view_k] or [rig.K_left] * len(options.view)
-        Ks = [rig.K_left, rig.K_right, *further][: len(images)]
-        poses = [np.eye(4), rig.E]
-        poses += [check_pose(read_matrix(path, "--view-E"), f"--view-E {path}") for path in options.view_e]
-    lenses = lenses_of(options, rig)
-    images = [pinhole(*each, config) for each in zip(images, Ks, lenses, strict=False)]
+        cameras = _cameras_with_poses(options, sizes, names, of_files=frames is None)
+    lenses = lenses_of(options, cameras.rig)
+    images = [pinhole(*each, config) for each in zip(images, cameras.Ks, lenses, strict=False)]
     known: dict[str, Any] = {"cropped": options.cropped}
-    known["points"] = _read_known(options, Ks[0], lenses[0], sizes[0], rig)
+    known["points"] = _read_known(options, cameras.Ks[0], lenses[0], sizes[0], cameras.rig)
     if options.points_confidence is not None:
         known["points_confidence"] = read_confidence(options.points_confidence, "--points-confidence")
-    if rig is None:
-        known["known_length"] = _known_length(options, Ks[0], lenses[0])
+    if cameras.rig is None:
+        known["known_length"] = _known_length(options, cameras.Ks[0], lenses[0])
         known["baseline_m"] = options.baseline
-        guidance = GeometryGuidance.from_photographs(images, K=Ks, **known, config=config)
+        guidance = GeometryGuidance.from_photographs(images, K=cameras.Ks, **known, config=config)
         rig = replace(guidance.rigs[0], size_left=sizes[0], size_right=sizes[1], source="estimated")
-    elif len(images) == 1:
+    else:
+        rig, guidance = cameras.rig, _posed_guidance(options, images, cameras, known)
+    undistorted_any = any(lens is not None for lens in lenses)
+    if "colmap" in options.export and not undistorted_any:  # before the work that it would lose
+        check_colmap_names(told_apart(options.photographs().values()))
+    prior_map = None if options.prior_map is None else read_map(options.prior_map, "--prior-map")
+    return PairInputs(images[0], rig, guidance, undistorted_any, prior_map, cameras.notes)
+
+
+def _cameras_without_poses(options: DepthOptions, sizes: Sequence[Size]) -> _Cameras:
+    way, notes = options.cameras_way(), list[str]()
+    paths = options.photographs().values()
+    Ks = [_intrinsics(options, way, path, i, sizes[i], notes) for i, path in enumerate(paths)]
+    return _Cameras(Ks, notes=tuple(notes))
+
+
+def _cameras_with_poses(
+    options: DepthOptions, sizes: Sequence[Size], names: tuple[str, str] | None, of_files: bool
+) -> _Cameras:
+    rig = read_rig(options, sizes[0], sizes[1] if len(sizes) > 1 else None, names)
+    if of_files:
+        for K, (name, path) in zip((rig.K_left, rig.K_right), options.photographs().items(), strict=False):
+            warn_of_other_lens(path, K, name)
+    further = [_matrix(path, "--view-K") for path in options.view_k] or [rig.K_left] * len(options.view)
+    poses = (check_pose(read_matrix(path, "--view-E"), f"--view-E {path}") for path in options.view_e)
+    return _Cameras([rig.K_left, rig.K_right, *further][: len(sizes)], rig, (np.eye(4), rig.E, *poses))
+
+
+def _posed_guidance(
+    options: DepthOptions, images: Sequence[np.ndarray], cameras: _Cameras, known: dict[str, Any]
+) -> GeometryGuidance:
+    """The guidance of a left image alone, which has known depths, or of posed views."""
+    rig, config = cameras.rig, options.config()
+    assert rig is not None
+    if len(images) == 1:
         if not options.cropped:
-            check_intrinsics_fit(rig.K_left, *sizes[0], "K", "LEFT")
+            height, width = images[0].shape[:2]
+            check_intrinsics_fit(rig.K_left, width, height, "K", "LEFT")
         guidance = GeometryGuidance(None, rig.K_left, **known, config=config)
     else:
-        known |= {"unit": rig.unit, "measured_baseline": rig.measured}
-        posed = list(zip(images, Ks, poses, strict=True))
+        known = known | {"unit": rig.unit, "measured_baseline": rig.measured}
+        posed = list(zip(images, cameras.Ks, cameras.poses, strict=True))
         guidance = GeometryGuidance.from_views(posed, **known, config=config)
     right_given = options.k_right is not None or options.cx_right is not None
-    if way in ("parameters", "matrices") and not right_given and not options.estimate_pose:
+    if options.cameras_way() in ("parameters", "matrices") and not right_given:
         assume_same_centre(guidance)
-    prior_map = None if options.prior_map is None else read_map(options.prior_map, "--prior-map")
-    return Inputs(images[0], rig, guidance, any(lens is not None for lens in lenses), prior_map)
+    return guidance
 
 
 def _read_view(path: Path, name: str) -> np.ndarray:
@@ -144,7 +188,9 @@ def _matrix(path: Path, option: str) -> np.ndarray:
     return check_intrinsics(read_matrix(path, option), f"{option} {path}" if "view" in option else option)
 
 
-def _intrinsics(options: DepthOptions, way: str, path: Path, i: int, size: Size) -> np.ndarray:
+def _intrinsics(
+    options: DepthOptions, way: str, path: Path, i: int, size: Size, notes: list[str]
+) -> np.ndarray:
     """K of photograph ``i`` without a pose, 0 being the left one, from the options, else from its EXIF."""
     if i > 1 and options.view_k:
         return _matrix(options.view_k[i - 2], "--view-K")
@@ -156,9 +202,8 @@ def _intrinsics(options: DepthOptions, way: str, path: Path, i: int, size: Size)
         return intrinsics(*(getattr(options, name) for name in PARAMETERS[:-1]))
     if options.fov is not None:
         return intrinsics_from_fov(options.fov, size)
-    K, notes = intrinsics_from_exif(path, path.name)
-    for note in notes:
-        say(note)
+    K, of_exif = intrinsics_from_exif(path, path.name)
+    notes += of_exif
     return K
 
 

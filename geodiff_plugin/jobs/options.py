@@ -6,14 +6,14 @@ import itertools
 import os
 import re
 from collections.abc import Collection, Iterable
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.capture import NEIGHBOURS, POINTS
 from geodiff_plugin.formats.files import check_file, open_image
-from geodiff_plugin.formats.out import OutFolder
+from geodiff_plugin.formats.out import OutFolder, free_folder
 from geodiff_plugin.options import CAMERAS, OUTPUT, PriorOptions, RunOptions, check_options, declare, flag_of
 
 #: What is read of a COLMAP model, the one kind of calibration that is a folder.
@@ -239,6 +239,13 @@ def check_files(options: DepthOptions, photographs: bool = True) -> None:
         model = any(os.path.exists(path / file) for file in (*MODEL_FILES, "images.bin"))
         if not (name == "calibration" and model):  # missing files of a model are reported when it is read
             check_file(path, name)
+
+
+def with_folder(options: DepthOptions, default: str) -> DepthOptions:
+    """With the folder that was named, else the default, with a number where that is taken."""
+    if options.out is not None:
+        return options
+    return replace(options, out=Path(default) if options.overwrite else free_folder(Path(default)))
 
 
 def start_pair(options: DepthOptions, photographs: bool = True) -> OutFolder:

@@ -1,0 +1,31 @@
+"""``geodiff video``, ``submit`` and ``convert``: the work, with its answer in a line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from geodiff_plugin.jobs.results import BENCHMARKS, write_submission, write_video
+from geodiff_plugin.jobs.telling import say
+from geodiff_plugin.priors.convert import convert_prior
+
+
+def run_video(
+    frames: Sequence[Path], out: Path, fps: float, near: float | None, far: float | None, overwrite: bool
+) -> None:
+    """Write the video and say how long it is."""
+    seconds = write_video(frames, out, fps, near, far, overwrite)
+    print(f"{len(frames)} frame{'s' * (len(frames) > 1)}, {seconds:.1f} s -> {out}")
+
+
+def run_submit(results: Sequence[Path], to: str, out: Path, method: str) -> None:
+    """Write the files and say where each lies."""
+    count = write_submission(results, to, out, method)
+    say(f"{out}: {count} pairs for {to} ({BENCHMARKS[to]})")
+
+
+def run_convert(paths: Sequence[Path], part: str | None = None, space: str | None = None) -> None:
+    """Convert and say where it is."""
+    kind = convert_prior(paths, part, space)
+    source, target = paths[-2:]
+    print(f"{source} ({kind}) -> {target}; use it with --prior {target}")

@@ -1,0 +1,326 @@
+"""Many pairs: one prior, four stages side by side, a folder and a table row a pair."""
+
+from __future__ import annotations
+
+import csv
+import errno
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin._threads import WithinCores
+from geodiff_plugin.evidence.inputs import left_images
+from geodiff_plugin.evidence.prepare import EvidenceStore
+from geodiff_plugin.formats import recordings
+from geodiff_plugin.formats.files import file_digest
+from geodiff_plugin.formats.out import OutFolder, atomic_path, reason_of
+from geodiff_plugin.formats.reading import has_pose_per_image
+from geodiff_plugin.jobs.options import DepthOptions, start_pair
+from geodiff_plugin.jobs.pair import run_pair, write_pair
+from geodiff_plugin.jobs.pairs import COLUMNS, SUMMARY, PairRef, options_of
+from geodiff_plugin.jobs.prior import prior_of_options
+from geodiff_plugin.jobs.reading import PairInputs, read_pair
+from geodiff_plugin.jobs.records import JobLog, PairRun
+from geodiff_plugin.jobs.report import read_report
+from geodiff_plugin.jobs.runner import BROKEN, Item, Journal, Runner
+from geodiff_plugin.jobs.steady import write_steady_frames
+from geodiff_plugin.jobs.telling import Tell, silent
+from geodiff_plugin.options import flag_of
+from geodiff_plugin.runtime.machine import pick_device
+
+#: What became of every pair, as it is known to all processes of a run.
+JOURNAL = ".pairs.jsonl"
+#: Options that a result does not depend on.
+NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "strict", "steady", "device", "encoding"}
+#: With one of these causes the next pair cannot be written either.
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+Row = dict[str, Any]
+
+
+class _EndsRun(BaseException):
+    """Ends the whole run: the prior does not load or the disk is full; its cause says which."""
+
+
+@contextmanager
+def _ends_run_on_full_disk() -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None and getattr(cause, "errno", None) not in DISK_FULL:
+            cause = cause.__cause__ or cause.__context__
+        if isinstance(cause, OSError):
+            resumes = "Finished pairs stay; the same command goes on with the rest."
+            full = InputError(f"The disk of --out is full ({reason_of(cause)}). {resumes}")
+            raise _EndsRun from full
+        raise
+
+
+class Views:
+    """The images of pairs that are frames of videos or of a bag, each opened once."""
+
+    def __init__(self, options: DepthOptions) -> None:
+        self._options = options
+        self._videos, self._open = dict[Path, recordings.VideoReader | recordings.BagReader](), ExitStack()
+
+    def close(self) -> None:
+        """Close the videos."""
+        self._open.close()
+
+    def of(self, ref: PairRef) -> Sequence[np.ndarray] | None:
+        """Left and right view of a pair of frames, ``(H, W, 3)`` in [0, 1]; ``None`` for one of files."""
+        if (frame := ref.frame) is None:
+            return None
+        for path in {ref.left, ref.right or ref.left} - set(self._videos):
+            bag = (self._options.bag_topics(), self._options.tolerance) if recordings.is_bag(path) else None
+            reader: Any = recordings.VideoReader(path) if bag is None else recordings.BagReader(path, *bag)
+            self._videos[path] = self._open.enter_context(reader)
+        left = self._videos[ref.left].read(frame)
+        if ref.right is None:
+            return recordings.both_halves(left, "LEFT")
+        return left, self._videos[ref.right].read(frame)
+
+
+@dataclass(eq=False)
+class _OnItsWay:
+    """A pair between two stages; ``entries`` of its report are those that only a run over many knows."""
+
+    options: DepthOptions
+    folder: OutFolder
+    log: JobLog
+    entries: dict[str, Any]
+    inputs: PairInputs
+    run: PairRun | None = None
+
+
+class Stages:
+    """The stages of a pair, each called in a thread of its own.
+
+    A ``pipe`` that is not given is loaded when the first pair has been read; ``among`` stages compute at the
+    same time and share the cores; ``tell`` hears which prior it is, and what was assumed.
+    """
+
+    def __init__(
+        self,
+        options: DepthOptions,
+        device: torch.device,
+        pipe: Any = None,
+        *,
+        among: int = 2,
+        tell: Tell = silent,
+    ) -> None:
+        self._options, self._device, self._pipe = options, device, pipe
+        self._among, self._tell = among, tell
+        self._views, self._folders = Views(options), dict[str, ExitStack]()
+
+    def close(self) -> None:
+        """Close the videos, when the threads are done."""
+        self._views.close()
+
+    def read(self, item: Item) -> _OnItsWay:
+        """Look at the files, take the folder, decode the views."""
+        ref: PairRef = item.payload
+        options = options_of(ref, self._options)
+        folder = start_pair(options, photographs=ref.frame is None)
+        held = self._folders[item.key] = ExitStack()
+        with _ends_run_on_full_disk():
+            held.enter_context(folder)
+        digests = _digests(options)  # before: what changes later is another version
+        entries = {"pair": {"name": ref.name, "frame": ref.frame, "sha256": digests}}
+        log = JobLog()
+        with log.stage("calibration"):
+            inputs = read_pair(options, self._views.of(ref))
+        for note in inputs.notes:
+            self._tell(note)
+        return _OnItsWay(options, folder, log, entries, inputs)
+
+    def evidence(self, pair: _OnItsWay) -> _OnItsWay:
+        """What the views say by themselves, into a store of the pair's own, where the call finds it."""
+        if self._pipe is None:
+            try:
+                tell = None if self._tell is silent else self._tell
+                self._pipe = prior_of_options(self._options, self._device, tell)
+            except Exception as error:
+                raise _EndsRun from error
+        device, guidance = self._pipe._execution_device, pair.inputs.guidance
+        plain = torch.autocast(device.type, enabled=False)
+        with pair.log.stage("evidence"), WithinCores(self._among), torch.no_grad(), plain:
+            guidance.evidence_store = EvidenceStore(1, copies=False)
+            guidance.prepare(left_images(pair.inputs.left).to(device))
+        return pair
+
+    def guide(self, pair: _OnItsWay) -> _OnItsWay:
+        """The guided call."""
+        with WithinCores(self._among):
+            pair.run = run_pair(self._pipe, pair.options, pair.inputs, pair.log)
+        pair.inputs.guidance.evidence_store = None
+        return pair
+
+    def write(self, pair: _OnItsWay) -> Row:
+        """The files, the report last, and the row of the table."""
+        assert pair.run is not None
+        with _ends_run_on_full_disk():
+            return _row(write_pair(pair.folder, pair.run, **pair.entries).report)
+
+    def release(self, item: Item) -> None:
+        """Give back the folder of a pair."""
+        self._folders.pop(item.key, ExitStack()).close()
+
+
+def _digests(options: DepthOptions) -> dict[str, str]:
+    """SHA-256 by path of the readable files that a pair is made from."""
+    digests = {}
+    for path in options.read_files():
+        with suppress(OSError):  # its reader says why
+            digests[str(path)] = file_digest(path)
+    return digests
+
+
+def finished_row(options: DepthOptions) -> Row | None:
+    """The row of a pair that an earlier run has finished; ``None`` where it is still to be done.
+
+    A result of other options, or of files whose content has changed since, is an error.
+    """
+    assert options.out is not None
+    report = read_report(options.out)
+    try:
+        made, row = report["arguments"], _row(report)
+        # The report is written last and names every file, so a folder that holds all of them is whole.
+        if not all((options.out / name).stat().st_size > 0 for name in report["files"]["names"]):
+            return None
+    except (OSError, KeyError, TypeError):
+        return None
+    wanted, of_fields = options.as_json(), DepthOptions.__dataclass_fields__
+    others = [n for n in wanted if n not in NOT_OF_THE_RESULT and wanted[n] != made.get(n, wanted[n])]
+    changes = [f"made with {flag_of(of_fields[n])} {made[n]} instead of {wanted[n]}" for n in others]
+    digests = report.get("pair", {}).get("sha256", {})
+    changed = [path for path, digest in _digests(options).items() if digests.get(path, digest) != digest]
+    changes += [f"made before {path} changed" for path in changed]
+    if changes:
+        cure = "Name another --out, add --overwrite to repeat all pairs, or remove this folder to repeat one."
+        got = f"{options.out}, {', '.join(changes)}"
+        bad_value("--out", "a folder of results of the same options and files", got, cure)
+    return row
+
+
+def _row(report: dict[str, Any]) -> Row:
+    """What the table says of a pair, and why it is not to be trusted."""
+    depth, verdict = report["depth"], report["verdict"]
+    return {
+        "near_m": depth["min_m"],
+        "median_m": depth["median_m"],
+        "far_m": depth["max_m"],
+        "verdict": verdict["status"],
+        "confidence": verdict["signs"]["confidence"] if verdict["status"] == "trusted" else None,
+        "seconds": round(sum(report["seconds"].values()), 3),
+        "message": " ".join(report["warnings"]) or None,
+        "reasons": " ".join(verdict["reasons"]),
+    }
+
+
+def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
+    """Refuse one baseline for all pairs of a model, because its pairs have different ones."""
+    given = [] if options.baseline is None or len(refs) < 2 else [options_of(ref, options) for ref in refs]
+    for calib in dict.fromkeys(each.calib for each in given if each.calib):
+        if has_pose_per_image(calib if len(calib) > 1 else calib[0]):
+            cure = "Every pair has its own. Give the model's scale: geodiff capture MODEL --known-length."
+            bad_value("--baseline", "left out with many pairs of one model", str(calib[0]), cure)
+
+
+def depth_pairs(
+    options: DepthOptions, refs: Sequence[PairRef], *, tell: Tell = silent, progress: bool = False
+) -> list[Row]:
+    """What ``geodiff depth`` does with many pairs: a folder each below ``options.out``, and ``pairs.csv``.
+
+    Finished pairs of an earlier run are kept; a pair that fails is a row, and the others go on.
+
+    Args:
+        options: of the command, with ``out``.
+        refs: of ``start_many`` with the same options.
+        tell: takes the lines for the user.
+        progress: whether a bar on stderr counts the pairs.
+
+    Returns:
+        A row a pair, in order, with ``COLUMNS``; ``result`` is ``"done"``, ``"there"`` or ``"failed"``.
+
+    Raises:
+        InputError: all pairs fail for one reason; results of other options; a full disk.
+    """
+    assert options.out is not None
+    _refuse_one_length(options, refs)
+    device, _ = pick_device(options.device), options.config()
+    journal, there = Journal(options.out / JOURNAL), dict[str, Row]()
+    items = [Item(r.name, r, words=(str(r.left), str(r.right), str(options.out / r.name))) for r in refs]
+    for item in items:
+        row = None if options.overwrite else finished_row(options_of(item.payload, options))
+        if row is None:
+            journal.forget(item)
+            continue
+        there[item.key] = row
+        if journal.get(item) is None:
+            journal.put(item, row)
+    runner = Runner(items, journal, noun="pair", survives=(Exception,), progress=progress)
+    process = runner.process
+    if device.type == "cuda" and device.index is None:
+        device = torch.device("cuda", process.local % torch.cuda.device_count())
+    stages = Stages(options, device, tell=tell if process.index == 0 else silent)
+    records = _through(stages, runner)
+    rows = [_final(record, there.get(record["key"]), options, tell) for record in records]
+    if process.index == 0:
+        _write_table(options.out / SUMMARY, rows, tell)
+        if options.steady:
+            failed = {row["pair"] for row in rows if row["result"] == "failed"}
+            with closing(Views(options)) as views:
+                whole = [ref for ref in refs if ref.name not in failed]
+                write_steady_frames(options, whole, views.of, tell)
+    return rows
+
+
+def _through(stages: Stages, runner: Runner) -> list[Row]:
+    """The records of all pairs, once they are through the stages."""
+    try:
+        with _ends_run_on_full_disk():
+            steps = (stages.read, stages.evidence, stages.guide, stages.write)
+            return runner.run(*steps, release=stages.release)
+    except _EndsRun as ended:
+        assert ended.__cause__ is not None
+        raise ended.__cause__ from None
+    except InputError:  # all of them, for one reason: no folder is left behind
+        journal = runner.journal
+        with suppress(OSError):
+            journal.close()  # Windows removes no open file
+            journal.path.unlink()
+            journal.path.parent.rmdir()
+        raise
+    finally:
+        stages.close()
+
+
+def _final(record: Row, there: Row | None, options: DepthOptions, tell: Tell) -> Row:
+    """A row of the table from a record of the journal, or from the report that an earlier run left."""
+    record = record | (there or {})
+    row = {name: record.get(name) for name in COLUMNS} | {"pair": record["key"]}
+    if record.get("status") == BROKEN:
+        return row | {"result": "failed", "message": record["error"]}
+    if not options.strict or record["verdict"] == "trusted":
+        return row | {"result": "there" if there else "done"}
+    assert options.out is not None
+    reason = f"The depth in {options.out / record['key']} is {record['verdict']}: {record['reasons']}"
+    tell(f"geodiff: {record['key']}: {reason}")  # --strict: it has failed
+    return dict.fromkeys(COLUMNS) | {"pair": record["key"], "result": "failed", "message": reason}
+
+
+def _write_table(out: Path, rows: Sequence[Row], tell: Tell) -> None:
+    try:
+        with atomic_path(out) as path, open(path, "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            writer.writeheader()
+            writer.writerows(rows)
+    except OSError as error:  # what became of the pairs is told, and each result is in its folder
+        tell(f"geodiff: {out} could not be written ({reason_of(error)}).")

@@ -1,0 +1,125 @@
+"""What is made of finished results: a video of their depth, and the files of a benchmark."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from geodiff_plugin import formats, plotting
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.depth import disparity_of_depth
+from geodiff_plugin.formats.files import read_npy
+from geodiff_plugin.formats.out import REPORT, check_new_file, write_text
+from geodiff_plugin.jobs.report import read_report
+
+#: Benchmarks by name, and where their files lie below the folder of a submission.
+BENCHMARKS = {
+    "middlebury": "SET/SCENE/disp0METHOD.pfm (disp0METHOD_s.pfm with holes), timeMETHOD.txt",
+    "eth3d": "low_res_two_view/SCENE.pfm, SCENE.txt",
+}
+
+
+def _map(path: Path) -> np.ndarray:
+    """The map of a frame, left in its file: those of a long video exceed the memory."""
+    file = formats.check_file(path, "FRAME", "a folder of geodiff depth or a .npy")
+    expected = "a depth map (H, W) of floats in metres"
+    depth_m = read_npy(file, "FRAME", expected)
+    if depth_m.ndim != 2 or depth_m.dtype.kind != "f" or not depth_m.size:
+        bad_value("FRAME", expected, f"{file}")
+    mapped: np.ndarray = np.load(file, mmap_mode="r")
+    return mapped
+
+
+def write_video(
+    frames: Sequence[Path],
+    out: Path,
+    fps: float,
+    near: float | None = None,
+    far: float | None = None,
+    overwrite: bool = False,
+) -> float:
+    """Join depth maps of a sequence into a video; how many seconds it lasts.
+
+    The legend is in metres unless a report says that its map has none.
+
+    Args:
+        frames: folders of ``geodiff depth``, or ``.npy`` maps ``(H, W)`` in metres, all of one size.
+        out: ``.mp4``, ``.webp`` or ``.gif``.
+        fps: frames a second.
+        near: depth of the last colour, metres; by default the maps' own.
+        far: depth of the first colour.
+        overwrite: whether a file of that name is replaced.
+    """
+    plotting.check_video(out, fps)
+    check_new_file(out, overwrite)
+    files = [path / "depth.npy" if os.path.isdir(path) else path for path in frames]
+    depths_m = [_map(file) for file in files]
+    sizes = ["{1}x{0}".format(*depth_m.shape) for depth_m in depths_m]
+    for path, size in zip(frames, sizes, strict=True):
+        if size != sizes[0]:
+            expected = f"all of one shape, {sizes[0]} pixels as {frames[0]}"
+            bad_value("FRAME", expected, f"{path} of {size}", "Make a video of each size.")
+    metric = all(read_report(file.parent).get("unit", "m") is not None for file in files)
+    pictures = plotting.depth_frames(depths_m, near=near, far=far, unit="m" if metric else None)
+    plotting.write_depth_video(out, pictures, fps)
+    return len(frames) / fps
+
+
+@dataclass(frozen=True)
+class _Submitted:
+    """One result for a benchmark: its scene's folder, disparities ``(H, W)`` in pixels, and seconds."""
+
+    scene: Path
+    disparity: np.ndarray
+    seconds: float
+
+
+def write_submission(results: Sequence[Path], to: str, out: Path, method: str = "GeoDiff") -> int:
+    """Write a disparity map and a time for every result below these folders; how many there are.
+
+    The folder of the left image names the scene. ``to`` is a key of ``BENCHMARKS``, ``method`` the name that
+    Middlebury's files bear.
+
+    Source: upload-format.html of Middlebury's evaluation 3; "Result submission" in ETH3D's documentation.
+    """
+    if to == "middlebury" and not method.isalnum():
+        bad_value("--method", "letters and digits", repr(method))
+    folders = [path.parent for folder in results for path in sorted(folder.glob(f"**/{REPORT}"))]
+    if not folders:
+        bad_value("RESULT", "a folder of geodiff depth", ", ".join(map(str, results)))
+    scenes: set[Path] = set()
+    for folder in folders:
+        result = _submitted(folder)
+        if result.scene in scenes:
+            expected = "one pair of every scene, whose folder its left image lies in"
+            bad_value("RESULT", expected, f"two of {result.scene}")
+        scenes.add(result.scene)
+        if to == "middlebury":
+            _write_middlebury(result, out, method)
+        else:
+            place = out / "low_res_two_view"
+            write_text(place / f"{result.scene.name}.txt", f"runtime {result.seconds:.2f}\n")
+            formats.write_pfm(place / f"{result.scene.name}.pfm", result.disparity)
+    return len(folders)
+
+
+def _submitted(folder: Path) -> _Submitted:
+    report = read_report(folder)
+    if "inputs" not in report:
+        bad_value("RESULT", "made by geodiff depth", folder)
+    K_left, K_right, E = (np.array(report["inputs"][n], np.float64) for n in ("K_left", "K_right", "E"))
+    depth_m = read_npy(folder / "depth.npy", "RESULT", "a depth map")
+    scene = Path(report["arguments"]["left"]).absolute().parent
+    disparity = disparity_of_depth(depth_m, K_left, K_right, E)
+    return _Submitted(scene, disparity, report["seconds"]["guided call"])
+
+
+def _write_middlebury(result: _Submitted, out: Path, method: str) -> None:
+    place = out / result.scene.parent.name / result.scene.name
+    holes = "_s" if np.isinf(result.disparity).any() else ""
+    write_text(place / f"time{method}.txt", f"{result.seconds:.2f}\n")
+    formats.write_pfm(place / f"disp0{method}{holes}.pfm", result.disparity)

@@ -1,0 +1,46 @@
+"""How a job tells its user something: line by line, to a callable; warnings become such lines too."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+#: Takes one line for the user: ``say`` on the command line, ``silent`` in a program that wants none.
+Tell = Callable[[str], None]
+PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
+
+
+def say(line: str) -> None:
+    """Print one line on stderr, apart from the results on stdout, and above a progress bar."""
+    tqdm = sys.modules.get("tqdm")
+    if tqdm is None:
+        print(line, file=sys.stderr, flush=True)
+    else:
+        tqdm.tqdm.write(line, file=sys.stderr)
+        sys.stderr.flush()
+
+
+def silent(_: str) -> None:
+    """Tell nobody."""
+
+
+@contextmanager
+def collected_warnings(tell: Tell = say) -> Iterator[None]:
+    """Tell every warning of this package once, as a line; those of others are shown as usual."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", category=UserWarning, module=r"geodiff_plugin")
+        shown_elsewhere, told = warnings.showwarning, set[str]()
+
+        def collect(message: Any, category: Any, filename: str, *rest: Any, **named: Any) -> None:
+            if PACKAGE_FOLDER not in Path(filename).resolve().parents:
+                shown_elsewhere(message, category, filename, *rest, **named)
+            elif str(message) not in told:
+                told.add(str(message))
+                tell(f"warning: {message}")
+
+        warnings.showwarning = collect
+        yield

@@ -1,0 +1,93 @@
+"""The files of a result: maps, pictures, clouds and exports."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from geodiff_plugin import formats, plotting
+from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.jobs.options import DepthOptions, told_apart
+from geodiff_plugin.jobs.reading import PairInputs
+from geodiff_plugin.jobs.report import single_map, used_poses
+from geodiff_plugin.types import MetricDepthOutput
+
+
+def write_maps(
+    folder: Path, output: MetricDepthOutput, left: np.ndarray, min_confidence: float = 0.0
+) -> dict[str, Any]:
+    """Write every file but exports and the report of the image ``left (H, W, 3)``; counts for the report."""
+    depth_m, K = single_map(output.prediction).astype(np.float32), np.asarray(output.K)[0]
+    formats.write_depth_npy(folder / "depth.npy", depth_m)
+    zeros = formats.write_depth_mm(folder / "depth_mm.png", depth_m)
+    plotting.depth_figure(depth_m, unit=output.unit).save(folder / "depth.png")
+    maps = {name: np.asarray(extra)[0] for name, extra in output.extras.items()}
+    of_call = {name: getattr(output, name) for name in ("photometric_error", "uncertainty", "confidence")}
+    maps |= {name: single_map(value) for name, value in of_call.items() if value is not None}
+    for name, values in maps.items():
+        np.save(folder / f"{name}.npy", values.astype(np.float32))
+    flying, doubtful, error = formats.flying_points(depth_m), np.zeros(depth_m.shape, dtype=bool), None
+    if output.visible is not None:
+        visible = single_map(output.visible).astype(bool)
+        Image.fromarray(visible.astype(np.uint8) * 255).save(folder / "visible.png")
+        error = np.where(visible, maps["photometric_error"], np.nan)
+    if output.confidence is not None:
+        plotting.share_figure(maps["confidence"], "confidence", 1.0).save(folder / "confidence.png")
+        doubtful = maps["confidence"] < min_confidence
+    plotting.overview(left, depth_m, maps.get("confidence"), error, output.unit).save(folder / "overview.png")
+    kept = ~(flying | doubtful)
+    points = formats.write_ply(folder / "cloud.ply", depth_m, left, K, valid=kept, unit=output.unit)
+    return {
+        "depth_mm_zero_pixels": zeros,
+        "cloud_points": points,
+        "flying_points": int(flying.sum()),
+        "doubtful_points": int(doubtful.sum()),
+    }
+
+
+def write_undistorted(folder: Path, image_01: np.ndarray, number: int = 1) -> str:
+    """Write a view without its lens distortion, 1 for the left one, to which the depth belongs; its name."""
+    name = "undistorted.png" if number == 1 else f"undistorted-{number}.png"
+    plotting.as_picture(image_01).save(folder / name)
+    return name
+
+
+def cameras_of(
+    output: MetricDepthOutput, guidance: GeometryGuidance
+) -> tuple[tuple[np.ndarray, np.ndarray, tuple[int, int]], ...]:
+    """``(K, E, (width, height))`` of every view of one image, left one first; poses as the call used them."""
+    depth_m, K = single_map(output.prediction), np.asarray(output.K)[0].astype(np.float64)
+    further = zip(guidance.rigs, used_poses(output, guidance), guidance.rights, strict=True)
+    rights = ((rig.K_right, E, (image.shape[-1], image.shape[-2])) for rig, E, image in further)
+    return ((K, np.eye(4), (depth_m.shape[1], depth_m.shape[0])), *rights)
+
+
+def pixels_of(
+    output: MetricDepthOutput, left: np.ndarray, least_confidence: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What ``make_cloud`` and ``make_mesh`` take: pixels of at least this confidence that do not fly."""
+    depth_m = single_map(output.prediction)
+    keep = ~formats.flying_points(depth_m)
+    if output.confidence is not None:
+        keep &= single_map(output.confidence) >= least_confidence
+    return depth_m, left, np.asarray(output.K)[0].astype(np.float64), keep
+
+
+def write_exports(folder: Path, output: MetricDepthOutput, inputs: PairInputs, options: DepthOptions) -> None:
+    """Write what ``--export`` asks for, and images of a COLMAP model that were undistorted."""
+    pixels = pixels_of(output, inputs.left, options.min_confidence)
+    cameras = cameras_of(output, inputs.guidance)
+    if "glb" in options.export:
+        formats.write_glb(folder / "cloud.glb", formats.make_cloud(*pixels), cameras)
+    if "mesh" in options.export:
+        formats.write_glb(folder / "mesh.glb", formats.make_mesh(*pixels), cameras)
+    if "colmap" in options.export:
+        names = told_apart(options.photographs().values())
+        if inputs.undistorted:
+            views = [inputs.left, *(image.permute(1, 2, 0).numpy() for image in inputs.guidance.rights)]
+            names = [write_undistorted(folder, image, number) for number, image in enumerate(views, 1)]
+        named = [(name, *view) for name, view in zip(names, cameras, strict=True)]
+        formats.write_colmap(folder, named, formats.make_cloud(*pixels))
