@@ -94,7 +94,7 @@ class ManyPairs:
         Raises:
             Exception: what a stage raised.
         """
-        stages = Stages(self._options, self._device, self._pipe, 2 if shared else 1)
+        stages = Stages(self._options, self._device, self._pipe, among=2 if shared else 1)
         steps = [stages.read, stages.evidence, stages.guide, stages.write]
         with tempfile.TemporaryDirectory() as folder, closing(stages):
             items = [Item(ref.name, ref) for ref in self._refs]
