@@ -310,7 +310,6 @@ def large(bench: Bench) -> Iterator[Row]:
 def folder(bench: Bench) -> Iterator[Row]:
     """Pairs a second of ``geodiff depth`` on a folder, and of the stock call on its left pictures."""
     from geodiff_plugin.jobs.options import DepthOptions  # and what the commands need, in this part alone
-
     from tests.benchmarks.many import MOST_ON_THE_WAY, ManyPairs
 
     where, size = bench.folder / "pairs", bench.scope.size
