@@ -5,19 +5,22 @@ Hirschmueller 2008, "Stereo processing by semiglobal matching and mutual informa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
+from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin.matching.census import COST_LEVELS
+from geodiff_plugin.matching.winner import NEVER
 
 #: Cost of a step of one plane between neighbouring pixels, in units of the largest matching cost.
 STEP_PENALTY = 0.15
 #: Cost of any larger step where the image is flat; difference in brightness that halves this cost.
 JUMP_PENALTY, JUMP_CONTRAST = 1.2, 0.1
-#: Up, down, left and right.
-PATHS = 4
-#: Above any sum over the paths; marks a plane that must not win.
-NEVER = 20_000
+#: Steps (rows, columns) along which paths run both ways: down and up, right and left.
+AXES = ((1, 0), (0, 1))
+PATHS = 2 * len(AXES)
 
 
 def empty_volume(planes: int, size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -68,29 +71,38 @@ def _scan_rows(cost: Tensor, p1: int, p2: Tensor, total: Tensor, *, fresh: bool)
             total[:, row].add_(path[i])
 
 
-def _limits(grey: Tensor) -> tuple[Tensor, Tensor]:
-    """Edge-adaptive P2 for vertical ``(H, W)`` and horizontal ``(W, H)`` paths: cheap jumps at edges."""
-    limits = []
-    for image in (grey, grey.T):
-        difference = torch.zeros_like(image)
-        difference[1:] = (image[1:] - image[:-1]).abs()
-        limit = JUMP_PENALTY / (1.0 + difference / JUMP_CONTRAST)
-        limit = limit.clamp_min(2.0 * STEP_PENALTY)
-        limits.append((COST_LEVELS * limit).round().to(torch.int16))
-    return limits[0], limits[1]
+def jump_penalties(grey: Tensor, axes: Sequence[tuple[int, int]]) -> Tensor:
+    """Edge-adaptive P2 of each axis, ``(A, H, W)`` int16: jumps at edges of ``grey (H, W)`` are cheap.
+
+    At a pixel stands the penalty between it and the one a step of the axis before it, which is the same both
+    ways. An axis is a step (rows, columns) of 0, 1 or -1 along rows and of 0 or 1 down.
+    """
+    difference = grey.new_zeros(len(axes), *grey.shape)
+    height, width = grey.shape
+    for of_axis, (down, across) in zip(difference, axes, strict=True):
+        left, right = max(across, 0), max(-across, 0)
+        later, before = grey[down:, left : width - right], grey[: height - down, right : width - left]
+        of_axis[down:, left : width - right] = (later - before).abs()
+    limit = JUMP_PENALTY / (1.0 + difference / JUMP_CONTRAST)
+    limit = limit.clamp_min(2.0 * STEP_PENALTY)
+    return (COST_LEVELS * limit).round().to(torch.int16)
 
 
 @torch.no_grad()
 def aggregate(levels: Tensor, grey: Tensor, *, buffers: Buffers | None = None) -> Tensor:
-    """Sums ``(D, H, W)`` int16, below ``NEVER``, of costs ``(D, H, W)`` uint8 along four paths.
+    """Sums ``(D, H, W)`` below ``NEVER`` of costs ``(D, H, W)`` uint8 along four paths.
 
-    A brightness edge in ``grey (H, W)``, the same view in [0, 1], makes a jump in depth cheaper. The result
-    stays in ``buffers`` until their next use.
+    They are int16, from the kernel int32. A brightness edge in ``grey (H, W)``, the same view in [0, 1],
+    makes a jump in depth cheaper. The result stays in ``buffers`` until their next use.
 
     Source: Hirschmueller 2008, Eq. 13.
     """
-    vertical, horizontal = _limits(grey)
-    step = round(COST_LEVELS * STEP_PENALTY)
+    penalties, step = jump_penalties(grey, AXES), round(COST_LEVELS * STEP_PENALTY)
+    if use_kernel(levels):
+        from geodiff_plugin.matching import kernels
+
+        return kernels.aggregate(levels, penalties, step, AXES)
+    vertical, horizontal = penalties[0], penalties[1].T
     planes, height, width = levels.shape
     buffers, paths = buffers or Buffers(), levels.new_empty(0, dtype=torch.int16)
     turned = buffers.empty("turned", planes, (width, height), levels)

@@ -8,11 +8,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.matching.aggregation import NEVER, PATHS, Buffers, aggregate
+from geodiff_plugin._kernels import use_kernel
+from geodiff_plugin.matching.aggregation import PATHS, Buffers, aggregate
 from geodiff_plugin.matching.alignment import AlignedView
 from geodiff_plugin.matching.census import COST_LEVELS
 from geodiff_plugin.matching.matches import Matches
-from geodiff_plugin.matching.sweep import UNSEEN_LEVEL, CostVolume
+from geodiff_plugin.matching.sweep import CostVolume
+from geodiff_plugin.matching.winner import UNSEEN_LEVEL, Winner, winner, winner_positions
 
 #: Log-odds that a checked match is right, linear in its evidence, by logistic regression on pairs with truth
 #: (``python -m tests.benchmarks.confidence`` refits them).
@@ -24,23 +26,23 @@ AGREEMENT_PLANES = 1.5
 CONTRAST_REACH, LEAST_CONTRAST = 15, 0.03
 # Only every second row of the right view is matched.
 _EVERY_ROW = 2
-# Packs a sum over the paths and its plane into one integer, so that one minimum finds both.
-_PLANES = 1 << 12
 
 
-def _winner(total: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The plane of least sum ``(D, H, W)``, its position between planes, its neighbours, and that sum."""
-    keys = torch.full_like(total[0], NEVER, dtype=torch.int32).mul_(_PLANES)
-    plane_keys = torch.empty_like(keys)
-    for plane in range(len(total)):
-        torch.minimum(keys, plane_keys.copy_(total[plane]).mul_(_PLANES).add_(plane), out=keys)
-    index, last = (keys % _PLANES).long(), len(total) - 1
-    around = (index + torch.arange(-1, 2, device=index.device)[:, None, None]).clamp_(0, last)
-    below, best, above = total.gather(0, around).float()
-    offset = 0.5 * (below - above) / (below + above - 2.0 * best).clamp_min(1e-6)
-    inner = (index > 0) & (index < last)
-    position = index + torch.where(inner, offset.clamp(-0.5, 0.5), torch.zeros_like(offset))
-    return index, position, around, best
+def _left_winner(volume: CostVolume, buffers: Buffers) -> Winner:
+    total = aggregate(volume.levels, volume.left_01[0], buffers=buffers)
+    if use_kernel(total):
+        from geodiff_plugin.matching import kernels
+
+        return kernels.winner(total, volume.levels, volume.in_view)
+    return winner(total, volume.levels, volume.in_view)
+
+
+def _positions(total: Tensor) -> Tensor:
+    if use_kernel(total):
+        from geodiff_plugin.matching import kernels
+
+        return kernels.winner_positions(total)
+    return winner_positions(total)
 
 
 def _right_winners(volume: CostVolume, view: AlignedView, buffers: Buffers) -> Tensor:
@@ -57,7 +59,7 @@ def _right_winners(volume: CostVolume, view: AlignedView, buffers: Buffers) -> T
     for k, of_plane in enumerate(volume.levels):
         plane[:height, :width] = of_plane
         levels[k] = plane.index_select(0, rows[k]).index_select(1, columns[k])
-    return _winner(aggregate(levels, view.grey[::_EVERY_ROW], buffers=buffers))[1]
+    return _positions(aggregate(levels, view.grey[::_EVERY_ROW], buffers=buffers))
 
 
 def _disagreement(view: AlignedView, other: Tensor, position: Tensor) -> Tensor:
@@ -87,35 +89,31 @@ def _disagreement(view: AlignedView, other: Tensor, position: Tensor) -> Tensor:
     return torch.where(inside, difference, torch.full_like(difference, torch.inf))
 
 
-def _contrast(volume: CostVolume, index: Tensor, reach: int) -> Tensor:
-    """By how much the chosen plane beats the mean plane before aggregation, averaged over a window."""
-    total, seen = (torch.zeros_like(index, dtype=torch.int32) for _ in range(2))
-    for levels, in_view in zip(volume.levels, volume.in_view, strict=True):
-        total += levels
-        seen += in_view
-    mean = (total - UNSEEN_LEVEL * (len(volume.levels) - seen)).float() / seen.clamp_min(1)
-    gain = (mean - volume.levels.gather(0, index[None])[0]).clamp_min(0.0)[None] / COST_LEVELS
+def _window_mean(gain: Tensor, reach: int) -> Tensor:
+    """Mean ``(H, W)`` over the part of a window of this half width that lies inside the image."""
+    mean = gain[None]
     for window in ((2 * reach + 1, 1), (1, 2 * reach + 1)):
         padding = (window[0] // 2, window[1] // 2)
-        gain = F.avg_pool2d(gain, window, 1, padding, count_include_pad=False)
-    return gain[0]
+        mean = F.avg_pool2d(mean, window, 1, padding, count_include_pad=False)
+    return mean[0]
 
 
 Candidates = tuple[Tensor, Tensor, Iterator[tuple[Tensor, Tensor]]]
 
 
 def candidates(volume: CostVolume, views: Sequence[AlignedView]) -> Candidates:
-    """Inverse depths ``(H, W)`` of the winners, their ``_contrast``, and the evidence of every right view.
+    """Inverse depths ``(H, W)`` of the winners, their contrast, and the evidence of every right view.
+
+    The contrast is how far the winner's cost before aggregation is below the mean plane's, averaged over a
+    window.
 
     The evidence ``(4, H, W)``, in which the log-odds of a match are linear, is 1, the logarithm of the margin
     to the best plane elsewhere, cost, and left-right difference; with it comes that difference in planes.
     """
     buffers = Buffers()
-    total = aggregate(volume.levels, volume.left_01[0], buffers=buffers)
-    index, position, around, best = _winner(total)
-    second = total.scatter_(0, around, NEVER).amin(dim=0)
-    unit = 1.0 / (PATHS * COST_LEVELS)
-    margin, cost = ((second - best) * unit).clamp(0.0, 0.5), (best * unit).clamp(0.0, 0.8)
+    found, unit = _left_winner(volume, buffers), 1.0 / (PATHS * COST_LEVELS)
+    position, cost = found.position, (found.best * unit).clamp(0.0, 0.8)
+    margin = ((found.runner_up - found.best) * unit).clamp(0.0, 0.5)
 
     def evidence() -> Iterator[tuple[Tensor, Tensor]]:
         for view in views:
@@ -123,7 +121,7 @@ def candidates(volume: CostVolume, views: Sequence[AlignedView]) -> Candidates:
             differs = difference.clamp_max(AGREEMENT_PLANES)
             yield torch.stack([torch.ones_like(margin), (margin + 0.03).log(), cost, differs]), difference
 
-    contrast = _contrast(volume, index, CONTRAST_REACH)
+    contrast = _window_mean(found.gain, CONTRAST_REACH)
     return volume.inverse_depth[0] + position * volume.plane_step, contrast, evidence()
 
 

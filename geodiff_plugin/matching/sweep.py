@@ -15,10 +15,9 @@ from geodiff_plugin.geometry import NEAREST_M, PlaneRays, image_size, is_rectifi
 from geodiff_plugin.matching.aggregation import empty_volume
 from geodiff_plugin.matching.alignment import AlignedView, ComparedView, align_view
 from geodiff_plugin.matching.census import COST_LEVELS, MARGIN_PX, census, grey_levels
+from geodiff_plugin.matching.winner import UNSEEN_LEVEL
 from geodiff_plugin.types import CameraView
 
-#: Cost where no right view sees the pixel on a plane: that of unrelated texture, neither good nor bad.
-UNSEEN_LEVEL = 78
 _LEAST_SHIFT_PX = 0.3
 
 

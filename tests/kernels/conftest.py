@@ -24,7 +24,7 @@ def _why_not(device: str) -> str | None:
     return None if torch.cuda.is_available() else "no CUDA device"
 
 
-@pytest.fixture(params=[_INTERPRETER, _CARD])
+@pytest.fixture(scope="session", params=[_INTERPRETER, _CARD])
 def device(request) -> torch.device:
     """The device of the tensors on which a kernel and its reference are compared."""
     reason = _why_not(request.param)

@@ -1,0 +1,87 @@
+"""Registers and spills of every Triton kernel, compiled without a card.
+
+    python -m tests.benchmarks.kernels
+
+Data flow: kernel, types of its arguments and constants -> machine code by Triton -> a table on standard
+output. A kernel that keeps part of its registers in memory (spills) makes the command fail.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+
+from geodiff_plugin.cli.terminal import new_table, show
+from geodiff_plugin.matching import kernels as matching
+
+#: Compute capabilities of an A100 and of an H100.
+ARCHITECTURES = (80, 90)
+_CUOBJDUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """A kernel as some stage launches it."""
+
+    name: str
+    kernel: Any
+    types: str  # of the arguments that are not constants, as Triton writes them
+    constants: dict[str, Any]
+    warps: int
+
+
+def launches() -> Iterator[Compiled]:
+    """Every kernel, at the largest sizes that are usual."""
+    paths = "*u8 *i16 *i32 i32 i32 i32 i32 i32 i32 i32"
+    for planes in (128, 256, 512):
+        axes = {"DOWN": (1, 0, 1, 1), "ACROSS": (0, 1, 1, -1), "PADDED": planes}
+        yield Compiled(f"paths, {planes} planes", matching.paths_kernel, paths, axes, 1)
+    winner = "*i32 *u8 *i1 *fp32 *fp32 *fp32 *fp32" + 9 * " i32"
+    for evidence in (True, False):
+        sizes = {"EVIDENCE": evidence, "BLOCK": 8, "PADDED": 128}
+        name = "winner and evidence" if evidence else "winner"
+        yield Compiled(name, matching.winner_kernel, winner, sizes, 4)
+
+
+def resources(launch: Compiled, architecture: int) -> tuple[int, int]:
+    """Registers of a thread, and bytes that it spills."""
+    names = [name for name in launch.kernel.arg_names if name not in launch.constants]
+    types = dict(zip(names, launch.types.split(), strict=True))
+    signature = {name: types.get(name, "constexpr") for name in launch.kernel.arg_names}
+    source = ASTSource(launch.kernel, signature, launch.constants)
+    target = GPUTarget("cuda", architecture, 32)
+    cubin = triton.compile(source, target=target, options={"num_warps": launch.warps}).asm["cubin"]
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "kernel.cubin"
+        file.write_bytes(cubin)
+        command = [str(_CUOBJDUMP), "--dump-resource-usage", str(file)]
+        told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    used = {name: int(count) for name, count in re.findall(r"(\w+):(\d+)", told)}
+    return used["REG"], used["STACK"] + used["LOCAL"]
+
+
+def main() -> None:
+    """Print the table."""
+    columns = [f"sm_{each}: registers, spilled bytes" for each in ARCHITECTURES]
+    table, spilling = new_table(("kernel", "warps", *columns)), []
+    for launch in launches():
+        found = [resources(launch, architecture) for architecture in ARCHITECTURES]
+        table.add_row(launch.name, str(launch.warps), *(f"{used}, {spilled}" for used, spilled in found))
+        if any(spilled for _, spilled in found):
+            spilling.append(launch.name)
+    show(table)
+    if spilling:
+        raise SystemExit(f"These kernels spill registers: {', '.join(spilling)}.")
+
+
+if __name__ == "__main__":
+    main()

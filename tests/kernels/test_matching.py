@@ -1,0 +1,94 @@
+"""Kernels of the matching equal their references, and a walk along every path in NumPy."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geodiff_plugin._kernels import without_kernels
+from geodiff_plugin.matching import aggregate
+from geodiff_plugin.matching.aggregation import jump_penalties
+from geodiff_plugin.matching.census import COST_LEVELS
+from geodiff_plugin.matching.winner import NEVER, winner, winner_positions
+
+SIZES = st.tuples(*(st.integers(1, most) for most in (37, 9, 11)))
+FOUR, EIGHT = [(1, 0), (0, 1)], [(1, 0), (0, 1), (1, 1), (1, -1)]
+
+
+def random_volume(size: tuple[int, int, int], seed: int, device: torch.device):
+    """Costs, where they are seen, and a grey image."""
+    generator = torch.Generator().manual_seed(seed)
+    levels = torch.randint(0, COST_LEVELS + 1, size, generator=generator).byte()
+    in_view = torch.rand(size, generator=generator) > 0.2
+    grey = torch.rand(size[1:], generator=generator).square()
+    return levels.to(device), in_view.to(device), grey.to(device)
+
+
+def walked(levels: np.ndarray, penalties: np.ndarray, step: int, axes) -> np.ndarray:
+    """Sums over all paths, pixel by pixel; a penalty stands at the later pixel of the way forward."""
+    total = np.zeros(levels.shape, int)
+    _, height, width = levels.shape
+    for penalty, (down, across) in zip(penalties, axes, strict=True):
+        for way in (1, -1):
+            path = np.zeros(levels.shape, int)
+            columns = range(width) if way * across >= 0 else range(width - 1, -1, -1)
+            rows = range(height) if way * down >= 0 else range(height - 1, -1, -1)
+            for y in rows:
+                for x in columns:
+                    path[:, y, x] = levels[:, y, x]
+                    v, u = y - way * down, x - way * across
+                    if 0 <= v < height and 0 <= u < width:
+                        before, at = path[:, v, u], (y, x) if way > 0 else (v, u)
+                        sides = np.pad(before, 1, constant_values=10**6) + step
+                        jump = np.full_like(before, before.min() + penalty[at])
+                        path[:, y, x] += (
+                            np.minimum.reduce([before, sides[2:], sides[:-2], jump]) - before.min()
+                        )
+            total += path
+    return total
+
+
+@settings(max_examples=8, deadline=None)
+@given(SIZES, st.integers(0, 99))
+def test_aggregation_equals_its_reference(device, size, seed):
+    levels, _, grey = random_volume(size, seed, device)
+    with without_kernels():
+        expected = aggregate(levels, grey)
+    assert torch.equal(aggregate(levels, grey).short(), expected)
+
+
+@pytest.mark.parametrize("axes", [FOUR, EIGHT, EIGHT[2:], EIGHT[3:]])
+@pytest.mark.parametrize("size", [(5, 6, 9), (33, 9, 4), (1, 3, 3), (6, 1, 5), (6, 5, 1)])
+def test_paths_in_any_direction(device, axes, size):
+    from geodiff_plugin.matching import kernels
+
+    levels, _, grey = random_volume(size, 1, device)
+    penalties = jump_penalties(grey, axes)
+    found = kernels.aggregate(levels.mT.contiguous().mT, penalties, 34, axes)
+    expected = walked(levels.cpu().numpy().astype(int), penalties.cpu().numpy().astype(int), 34, axes)
+    np.testing.assert_array_equal(found.cpu().numpy(), expected)
+
+
+@settings(max_examples=8, deadline=None)
+@given(SIZES, st.integers(0, 99))
+def test_the_winner_equals_its_reference(device, size, seed):
+    from geodiff_plugin.matching import kernels
+
+    levels, in_view, grey = random_volume(size, seed, device)
+    total = aggregate(levels, grey)
+    total[:, ::3] = total[:1, ::3]  # ties: the first plane wins
+    found, position = kernels.winner(total, levels, in_view), kernels.winner_positions(total)
+    expected = winner(total.short(), levels, in_view)
+    for name in ("position", "best", "runner_up"):
+        assert torch.equal(getattr(found, name), getattr(expected, name)), name
+    torch.testing.assert_close(found.gain, expected.gain, rtol=1e-5, atol=1e-7)
+    assert torch.equal(position, winner_positions(total.short()))
+
+
+def test_few_planes_have_no_runner_up(device):
+    from geodiff_plugin.matching import kernels
+
+    levels, in_view, grey = random_volume((3, 4, 5), 2, device)
+    levels[1] = 0
+    assert (kernels.winner(aggregate(levels, grey), levels, in_view).runner_up == NEVER).all()
