@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_type, bad_value, warn
+from geodiff_plugin._checks import bad_type, bad_value, refuse, warn
+from geodiff_plugin.messages import Message
 
 #: A longer baseline, a scene or known depths all of which are further may be in millimetres.
 LONG_BASELINE_M, FAR_SCENE_M, FAR_POINTS_M = 20.0, 200.0, 100.0
@@ -53,9 +54,11 @@ def check_intrinsics_fit(K: np.ndarray, width: int, height: int, name: str, imag
     """Refuse a camera matrix whose principal point lies outside the image that it comes with."""
     cx, cy = K[0, 2], K[1, 2]
     if not (0 <= cx <= width and 0 <= cy <= height):
-        got = f"principal point ({cx:.1f}, {cy:.1f}) outside of it"
-        cure = f"It probably belongs to another resolution: {SCALED_K}. If it is a crop, say so with "
-        bad_value(name, f"for {image} of {width}x{height} pixels", got, cure + "cropped=True (--cropped).")
+        refuse(
+            f"{name} puts the principal point ({cx:.1f}, {cy:.1f}) outside {image} of {width}x{height} "
+            f"pixels. It probably belongs to another resolution: {SCALED_K}. If the image is a crop, say so "
+            "with cropped=True (--cropped)."
+        )
 
 
 def check_calibrated_size(
@@ -82,10 +85,11 @@ def check_size_of(K: np.ndarray, size: tuple[int, int], name: str, image: str) -
         place = f"where that of an image {x + y:.2g} times the size of {image} would be"
     if place:
         at = f"{name} has its principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) {place}"
-        warn(f"{at}. If it is for another resolution, {SCALED_K}.", doubt=True)
+        warn(Message("camera.principal-point", f"{at}. If it is for another resolution, {SCALED_K}."))
     if max(K[0, 0] / K[1, 1], K[1, 1] / K[0, 0]) > STRETCHED:
         numbers = f"{name} has fx {K[0, 0]:.5g} and fy {K[1, 1]:.5g}"
-        warn(f"{numbers}; pixels are about square, so one of them may be mistyped.")
+        sentence = f"{numbers}; pixels are about square, so one of them may be mistyped."
+        warn(Message("camera.stretched", sentence))
 
 
 def check_pose(E: Any, name: str = "E", cure: str = POSE) -> np.ndarray:
@@ -116,7 +120,7 @@ def check_baseline(E: np.ndarray, name: str, unit: str | None) -> None:
         bad_value(name, expected, f"a translation of {baseline:.1g} m", cure)
     if unit == "m" and baseline > LONG_BASELINE_M:
         cure = "If that is millimetres, divide E, or baseline_m (--baseline, --metres-per-unit), by 1000."
-        warn(f"{name} has a baseline of {baseline:.4g} m. {cure}", doubt=True)
+        warn(Message("baseline.long", f"{name} has a baseline of {baseline:.4g} m. {cure}"))
 
 
 def check_metres(array: np.ndarray, name: str, got: str = "") -> None:
@@ -140,4 +144,4 @@ def warn_of_far_points(points: np.ndarray, name: str) -> None:
         kind = "only whole numbers" if whole else "none nearer"
         cure = "divide them by 1000, or give --points-scale 1000 (scale=1000) with a file."
         depths_are = f"{name} has depths of {depths.min():.4g} m and more, {kind}"
-        warn(f"{depths_are}. If they are millimetres, {cure}", doubt=True)
+        warn(Message("points.far", f"{depths_are}. If they are millimetres, {cure}"))

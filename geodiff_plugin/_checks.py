@@ -9,9 +9,11 @@ from contextvars import ContextVar
 from numbers import Integral, Real
 from typing import Any, NoReturn
 
+from geodiff_plugin.messages import Message
+
 LONGEST_GOT = 400
 #: What ``warn`` says goes to the innermost ``noted`` block too.
-_NOTED: ContextVar[dict[str, bool] | None] = ContextVar("noted", default=None)
+_NOTED: ContextVar[list[Message] | None] = ContextVar("noted", default=None)
 
 
 class InputError(ValueError):
@@ -49,26 +51,26 @@ def refuse(sentences: str) -> NoReturn:
     raise InputError(sentences)
 
 
-def warn(sentence: str, *, doubt: bool = False, stacklevel: int = 2) -> None:
-    """Warn, and tell the ``noted`` block around; a result with a ``doubt`` is not to be trusted."""
-    warned = _NOTED.get()
-    if warned is not None:
-        warned[sentence] = warned.get(sentence, False) or doubt
-    warnings.warn(sentence, stacklevel=stacklevel + 1)
+def warn(message: Message, *, stacklevel: int = 2) -> None:
+    """Warn, and tell the ``noted`` block around."""
+    noticed = _NOTED.get()
+    if noticed is not None and message not in noticed:
+        noticed.append(message)
+    warnings.warn(message, stacklevel=stacklevel + 1)
 
 
 @contextmanager
-def noted() -> Iterator[dict[str, bool]]:
-    """Every sentence that ``warn`` says inside, and whether it is a doubt; blocks may be nested."""
-    warned: dict[str, bool] = {}
+def noted() -> Iterator[list[Message]]:
+    """Every message that ``warn`` is given inside, each sentence once; blocks may be nested."""
+    noticed: list[Message] = []
     outer = _NOTED.get()
-    token = _NOTED.set(warned)
+    token = _NOTED.set(noticed)
     try:
-        yield warned
+        yield noticed
     finally:
         _NOTED.reset(token)
         if outer is not None:
-            outer.update(warned)
+            outer += [message for message in noticed if message not in outer]
 
 
 def _check_kind(value: Any, name: str, integer: bool) -> None:

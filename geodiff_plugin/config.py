@@ -9,13 +9,21 @@ import difflib
 import inspect
 import json
 import re
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_flag, check_number, check_range
+from geodiff_plugin._checks import (
+    bad_type,
+    bad_value,
+    check_choice,
+    check_flag,
+    check_number,
+    check_range,
+    warn,
+)
+from geodiff_plugin.messages import Message
 
 #: Weights of the default preset.
 DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "points": 1.0, "prior_pull": 0.01, "anchor": 1.0}
@@ -262,7 +270,7 @@ class GuidanceConfig:
             flat |= value if is_stage else {name: value}
         known = {n: v for n, v in flat.items() if n in KNOBS or difflib.get_close_matches(n, KNOBS, 1, 0.85)}
         if gone := [name for name in flat if name not in known]:
-            warnings.warn(f"No longer knobs, and left out: {', '.join(gone)}.", stacklevel=2)
+            warn(Message("config.former-knobs", f"No longer knobs, and left out: {', '.join(gone)}."))
         return cls().changed(**known)
 
     def save(self, path: str | Path) -> None:

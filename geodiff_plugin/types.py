@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from diffusers.utils import BaseOutput
 
+from geodiff_plugin.messages import Message
+
 
 @dataclass(frozen=True, eq=False)
 class Distortion:
@@ -74,7 +76,7 @@ class PoseReport:
     matches: tuple[float, ...] = ()  # number of matches of each right view
     straightened_px: tuple[float, ...] = ()  # root mean square displacement of the right images; 0 for none
     scale_spread: float | None = None  # relative, of the scale of refined poses; None for measured baselines
-    warnings: tuple[str, ...] = ()  # sentences for the user
+    warnings: tuple[Message, ...] = ()
 
 
 class CameraView(NamedTuple):
@@ -139,8 +141,9 @@ class MetricDepthOutput(BaseOutput):
             ``"prior"`` or ``"none"``; ``None`` for given poses, but ``"prior"`` where they had no unit.
         scale_spread: relative spread of that scale over matches or the prior's map; ``None`` if unknown.
         rescaled: factor from the lengths of ``GeometryGuidance`` to metres, if only the prior knows the unit.
-        warnings: sentences for the user about this result, and those that the guidance gave when it was made.
-        assumed: sentences on assumed inputs, such as the right camera's principal point.
+        warnings: sentences for the user about this result, and those that the guidance gave when it was made;
+            each has a ``code`` (``geodiff_plugin.messages``, docs/reference/messages.md).
+        assumed: likewise on assumed inputs, such as the right camera's principal point.
     """
 
     prediction: np.ndarray | torch.Tensor
@@ -165,8 +168,8 @@ class MetricDepthOutput(BaseOutput):
     rescaled: float = 1.0
     extras: dict[str, np.ndarray | torch.Tensor] = field(default_factory=dict)
     verdicts: list[Any] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    assumed: list[str] = field(default_factory=list)
+    warnings: list[Message] = field(default_factory=list)
+    assumed: list[Message] = field(default_factory=list)
 
     @property
     def verdict(self) -> Any:

@@ -13,6 +13,7 @@ LAYER = {
     "_checks": 0,
     "_kernels": 0,
     "_threads": 0,
+    "messages": 0,
     "types": 0,
     "geometry": 1,
     "config": 1,

@@ -20,6 +20,7 @@ from geodiff_plugin.formats.captures import CaptureFrame, read_capture
 from geodiff_plugin.formats.depth import read_depth_png
 from geodiff_plugin.formats.images import read_image, undistorted
 from geodiff_plugin.formats.recordings import VideoReader
+from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.capture import SolvedCapture, solve_capture
 from geodiff_plugin.types import MetricDepthOutput
 
@@ -48,7 +49,7 @@ class Capture:
     """
 
     def __init__(
-        self, frames: Sequence[CaptureFrame], kind: str, unit: str | None, notes: Sequence[str]
+        self, frames: Sequence[CaptureFrame], kind: str, unit: str | None, notes: Sequence[Message]
     ) -> None:
         self.frames, self.kind, self.unit, self.notes = list(frames), kind, unit, list(notes)
         self.names = [frame.name for frame in frames]

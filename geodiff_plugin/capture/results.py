@@ -19,6 +19,7 @@ from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb, write
 from geodiff_plugin.formats.depth import write_depth_mm, write_depth_npy
 from geodiff_plugin.formats.out import atomic_path, write_text
 from geodiff_plugin.formats.sfm import write_colmap
+from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.capture import Observations
 
 #: Depth and confidence of a frame by its own run, which agreement starts from whenever it is made anew.
@@ -158,7 +159,7 @@ def _video(capture: Capture, out: Path, names: Sequence[str]) -> None:
     try:
         plotting.write_depth_video(out / "video.mp4", frames(), VIDEO_FPS)
     except InputFileError as error:  # an OpenCV without codecs; everything else is there
-        warn(str(error))
+        warn(Message("capture.no-video", str(error)))
 
 
 def normals_of(depth: np.ndarray, K: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ import geodiff_plugin.matching as matching
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.geometry import PlaneRays, image_size, plane_rays, resize_image
 from geodiff_plugin.matching import CostVolume, Matches
+from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.scale.points import RELIABLE, reliable_matches
 from geodiff_plugin.types import CameraView, PoseReport
@@ -35,7 +36,7 @@ class Evidence:
     reliable: Matches | None = None  # ``matches`` as points for the search, where enough are reliable
     native_views: tuple[CameraView, ...] = ()  # cleaned, with the poses in use, at their native sizes
     pose: PoseReport | None = None  # how their poses fit
-    warnings: tuple[str, ...] = ()  # sentences for the user
+    warnings: tuple[Message, ...] = ()
 
 
 def within(evidence: Evidence, valid: Tensor) -> Evidence:
@@ -63,7 +64,7 @@ def prepare_evidence(
     """
     left, further, K = matching.to_grid(left_01, views, K_left, config.sweep_pixels)
     volume, matches, known_points = None, None, None
-    warnings: list[str] = [] if pose is None else list(pose.warnings)
+    warnings: list[Message] = [] if pose is None else list(pose.warnings)
     if views and (config.search == "volume" or needs_matches):
         pair = left_01, views, K_left
         volume = matching.build_cost_volume(*pair, depth_range=config.depth_range, config=config)
@@ -75,7 +76,8 @@ def prepare_evidence(
         sizes = image_size(left_01), image_size(left)
         known_points, left_out = matching.points_to_matches(points, K_left, *sizes)
         if left_out:
-            warnings.append(f"{left_out} points outside the left image are left out: is their frame right?")
+            sentence = f"{left_out} points outside the left image are left out: is their frame right?"
+            warnings.append(Message("points.outside", sentence))
     reliable = None if matches is None else reliable_matches(matches)
     # Read back from the device now, so that no step waits for it.
     if volume is not None:
@@ -83,9 +85,9 @@ def prepare_evidence(
     for target in (matches, known_points, reliable):
         if target is not None:
             _ = target.above(0.0), target.above(RELIABLE)
-    distinct = tuple(dict.fromkeys(warnings))  # two checks may find the same mistake
     depths = volume, matches, known_points, reliable
-    return Evidence(left, left_01, K, further, *depths, tuple(views), pose, distinct)
+    # Two checks may find the same mistake.
+    return Evidence(left, left_01, K, further, *depths, tuple(views), pose, distinct(warnings))
 
 
 @dataclass(frozen=True)

@@ -20,13 +20,15 @@ from geodiff_plugin.evidence.inputs import read_inputs, split_views
 from geodiff_plugin.evidence.prepare import EstimatedRig, EvidenceStore, estimate_rig, make_evidence
 from geodiff_plugin.formats import picture_size, read_calibration
 from geodiff_plugin.geometry import image_size
+from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Rig
 
 #: The assumption about a rectified pair if only one K is given.
-SAME_CENTRE = (
+SAME_CENTRE = Message(
+    "camera.same-centre",
     "The right camera's cx is assumed to be the left one's. If it is not, every depth is off: each pixel of "
     "difference (doffs) shifts all disparities by one. Give the right camera's cx, which is cx + doffs "
-    "(K_right, or --cx-right)."
+    "(K_right, or --cx-right).",
 )
 #: Cosine of the angle below which two cameras count as parallel.
 PARALLEL = 0.9999
@@ -70,8 +72,8 @@ class GeometryGuidance:
         evidence_store: cache of cost volumes and matches for further calls with the same images, cameras and
             settings; ``None``, the default, for no cache.
         estimated: cameras estimated by ``from_photographs``; ``None`` where poses were given.
-        warned: every warning of the construction, and whether it makes the result untrusted.
-        assumed: sentences on inputs that were assumed because they were not given.
+        warned: every warning of the construction; one that ``forbids_trust`` makes the result untrusted.
+        assumed: messages on inputs that were assumed because they were not given.
 
     Raises:
         InputError: an argument of the wrong type, rank, size or range, or a pose that is not rigid. It is a
@@ -116,7 +118,7 @@ class GeometryGuidance:
             check_choice(name, "a key of weights", TERMS)
         with noted() as self.warned:
             self.inputs = read_inputs(right, K, E, points, points_confidence, cropped=cropped, unit=unit)
-        self.assumed: list[str] = []
+        self.assumed: list[Message] = []
         if not isinstance(K, (tuple, list)):
             assume_same_centre(self)
         self.measured_baseline = measured_baseline

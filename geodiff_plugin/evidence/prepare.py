@@ -20,6 +20,7 @@ from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.geometry import image_size, resize_intrinsics, unproject
 from geodiff_plugin.matching import clean
+from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.estimate import Scale, estimate_poses, find_scale, polished
 from geodiff_plugin.pose.refine import refine_views, untouched
 from geodiff_plugin.pose.solve import depth_spread, undetermined_pose
@@ -110,19 +111,19 @@ class EstimatedRig:
     residual_px: tuple[float, ...]  # median distance of the inliers from their epipolar lines
     depth_spread: float | None  # relative, caused by errors of the poses; ``None`` for a rectified pair
     scale: Scale  # where the unit comes from
-    notes: tuple[str, ...]  # sentences about what was assumed
-    warnings: tuple[str, ...]  # sentences for the user
+    notes: tuple[Message, ...]  # what was assumed
+    warnings: tuple[Message, ...]
 
 
 def _cameras(
     photographs: Sequence[Any], images: Sequence[Tensor], K: Any, fov: float | None, cropped: bool
-) -> tuple[list[np.ndarray], list[str]]:
+) -> tuple[list[np.ndarray], list[Message]]:
     """K of every photograph, and what was assumed for it."""
     given = list(K) if isinstance(K, (tuple, list)) and np.ndim(K[0]) == 2 else [K] * len(images)
     if len(given) != len(images):
         bad_value("K", f"one matrix, or {len(images)} of them", f"{len(given)}")
     Ks: list[np.ndarray] = []
-    notes: list[str] = []
+    notes: list[Message] = []
     for i, (photograph, image, matrix) in enumerate(zip(photographs, images, given, strict=True)):
         name = "the left photograph" if i == 0 else f"right photograph {i}"
         size = (image.shape[-1], image.shape[-2])
@@ -133,9 +134,9 @@ def _cameras(
         elif fov is not None:
             Ks.append(intrinsics_from_fov(fov, size))
         elif hasattr(photograph, "getexif"):
-            from_exif, sentences = intrinsics_from_exif(photograph, name)
+            from_exif, assumed = intrinsics_from_exif(photograph, name)
             Ks.append(from_exif)
-            notes += sentences
+            notes += assumed
         else:
             cure = "Give K, a field of view (fov), or PIL images that carry their EXIF."
             bad_value(f"K of {name}", "known", "an array without EXIF", cure)

@@ -23,6 +23,7 @@ from geodiff_plugin.formats.files import (
 from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.formats.recordings import is_video, video_facts
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, lens_of, reading_whole, resized, rigid
+from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Distortion
 
 IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
@@ -69,7 +70,7 @@ def read_capture(
     K: np.ndarray | None = None,
     fov: float | None = None,
     trajectory: PathLike | None = None,
-) -> tuple[list[CaptureFrame], str, str | None, list[str]]:
+) -> tuple[list[CaptureFrame], str, str | None, list[Message]]:
     """The frames of a capture in order, the kind of its layout, its unit, and notes for the user.
 
     ``K`` and ``fov`` (horizontal, degrees) are for layouts without intrinsics, and go before the files'.
@@ -95,14 +96,19 @@ def read_capture(
         skipped["no pose"] = [frame.name for frame in frames if frame.E is None]
         frames = [frame for frame in frames if frame.E is not None]
     notes = [
-        f"{', '.join(names[:5])}{', ...' * (len(names) > 5)}: {why}; {len(names)} skipped."
+        Message(
+            "capture.skipped",
+            f"{', '.join(names[:5])}{', ...' * (len(names) > 5)}: {why}; {len(names)} skipped.",
+        )
         for why, names in skipped.items()
         if names
     ]
     if K is None and fov is None and any(c is SEVEN_SCENES or c is TUM_RGBD for _, c in whole):
-        notes.append(f"Assumed: K of the cameras of {kind}, 525 px at 640x480. Give --K for another.")
+        sentence = f"Assumed: K of the cameras of {kind}, 525 px at 640x480. Give --K for another."
+        notes.append(Message("capture.assumed-k", sentence))
     if kind == "video" and trajectory is None:
-        notes.append("No --trajectory: the poses are estimated, without a unit.")
+        sentence = "No --trajectory: the poses are estimated, without a unit."
+        notes.append(Message("capture.no-trajectory", sentence))
     if len({frame.name for frame in frames}) < len(frames):  # of two folders, whose names tell them apart
         frames = [replace(frame, name=f"{frame.image.parent.name}-{frame.name}") for frame in frames]
     if len(frames) < 2:

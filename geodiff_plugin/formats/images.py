@@ -14,6 +14,7 @@ from PIL.ExifTags import IFD, Base
 from geodiff_plugin._checks import InputError, bad_type, bad_value, check_number, warn
 from geodiff_plugin.formats.files import ORIENTATION, PathLike, open_image
 from geodiff_plugin.formats.rigs import COEFFICIENT_COUNTS, intrinsics
+from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Distortion
 
 #: Fewer pixels a side hold no matches; also the VAE's smallest sensible latent.
@@ -57,28 +58,30 @@ def _array_of(image: Image.Image, name: str) -> np.ndarray:
     return np.asarray(image.convert("RGBA" if alpha else "RGB"))
 
 
-def _file_notes(image: Image.Image, name: str) -> list[str]:
+def _file_notes(image: Image.Image, name: str) -> list[Message]:
     """What to say of an opened image before its pixels: several frames; few of 16 bits used, in colour."""
-    notes, frames = list[str](), getattr(image, "n_frames", 1)
+    notes, frames = list[Message](), getattr(image, "n_frames", 1)
     if frames > 1 and image.format in SEVERAL:
-        notes.append(f"{name} holds {frames} frames or pages; only the first is taken.")
+        sentence = f"{name} holds {frames} frames or pages; only the first is taken."
+        notes.append(Message("image.frames", sentence))
     # Pillow loads the upper 8 bits of these, and tells only before.
     if any(";16" in str(tile[3]) for tile in getattr(image, "tile", ())) and not image.mode.startswith("I"):
         notes += _dark_notes(257 * int(np.asarray(image.convert("RGB")).max()), name)
     return notes
 
 
-def _dark_notes(most: int, name: str) -> list[str]:
+def _dark_notes(most: int, name: str) -> list[Message]:
     said = f"{name} is a 16-bit image that is nearly black: its values reach {most} of 65535."
     cure = "If its camera has 12 bits, multiply them by 16; with 10 bits, by 64."
-    return [f"{said} {cure}"] if most < DARK_16_BITS else []
+    return [Message("image.dark", f"{said} {cure}")] if most < DARK_16_BITS else []
 
 
-def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
+def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[Message]]:
     """``(H, W, 3)`` float32 in [0, 1] of ``(H, W)`` or ``(H, W, C)`` numbers, and what to say of them."""
-    value, notes = value[..., None] if value.ndim == 2 else value, []
+    value, notes = value[..., None] if value.ndim == 2 else value, list[Message]()
     if value.shape[-1] == 4:
-        value, notes = value[..., :3], [f"{name} has an alpha channel; it is dropped."]
+        value = value[..., :3]
+        notes.append(Message("image.alpha", f"{name} has an alpha channel; it is dropped."))
     if value.dtype in (np.uint8, np.uint16):
         notes += _dark_notes(int(value.max()), name) if value.dtype == np.uint16 else []
         value = value.astype(np.float32) / np.iinfo(value.dtype).max
@@ -96,8 +99,8 @@ def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
     return np.repeat(value, 3, axis=-1) if value.shape[-1] == 1 else value, notes
 
 
-def read_image(path: PathLike, name: str = "left") -> tuple[np.ndarray, list[str]]:
-    """An image file, upright, ``(H, W, 3)`` float32 in [0, 1], and sentences about what was done to it."""
+def read_image(path: PathLike, name: str = "left") -> tuple[np.ndarray, list[Message]]:
+    """An image file, upright, ``(H, W, 3)`` float32 in [0, 1], and what was done to it."""
     with open_image(path, name) as image:
         notes = _file_notes(image, name)
         image.seek(0)
@@ -108,7 +111,7 @@ def read_image(path: PathLike, name: str = "left") -> tuple[np.ndarray, list[str
     notes += more
     if is_turned:
         said = f"{name} was turned or mirrored to {upright.width}x{upright.height}, as its EXIF says"
-        notes.append(f"{said}; K must belong to the turned image.")
+        notes.append(Message("image.turned", f"{said}; K must belong to the turned image."))
     return image_01, notes
 
 
@@ -155,7 +158,8 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
         hwc, more = _to_01(_array_of(value, name), name)
         if value.getexif().get(ORIENTATION) in TURNS:
             cure = "turn it with PIL.ImageOps.exif_transpose and give the K of the turned image."
-            more.append(f"{name} carries an EXIF orientation that is not applied; {cure}")
+            sentence = f"{name} carries an EXIF orientation that is not applied; {cure}"
+            more.append(Message("image.orientation", sentence))
     else:
         notes, (hwc, more) = [], _to_01(_hwc(value, name), name)
     for note in notes + more:
@@ -170,7 +174,7 @@ def intrinsics_from_fov(fov_deg: float, size: tuple[int, int]) -> np.ndarray:
     return intrinsics(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
 
 
-def intrinsics_from_exif(source: PathLike | Image.Image, name: str) -> tuple[np.ndarray, list[str]]:
+def intrinsics_from_exif(source: PathLike | Image.Image, name: str) -> tuple[np.ndarray, list[Message]]:
     """K of a photograph to a few per cent, of a file upright, of an image as it lies; what was assumed."""
     if not isinstance(source, Image.Image):
         with open_image(source, name) as image:
@@ -198,16 +202,18 @@ def intrinsics_from_exif(source: PathLike | Image.Image, name: str) -> tuple[np.
     per_unit_x, zoom = number(Base.FocalPlaneXResolution), number(Base.DigitalZoomRatio)
     if focal_35:
         fx = fy = focal_35 * math.hypot(width, height) / _DIAGONAL_35_MM
-        notes = [f"K of {name}: {focal_35:g} mm in 35 mm equivalent by its EXIF, {fx:.0f} px."]
+        focal = f"{focal_35:g} mm in 35 mm equivalent"
     elif focal_mm and per_unit_x and taken[0]:
         mm = _MM_PER_UNIT.get(int(number(Base.FocalPlaneResolutionUnit) or 2), 25.4)
         fx = focal_mm * per_unit_x / mm * (max(width, height) / max(taken)) * max(zoom, 1.0)
         fy = fx * (number(Base.FocalPlaneYResolution) or per_unit_x) / per_unit_x
-        notes = [f"K of {name}: {focal_mm:g} mm on its sensor by its EXIF, {fx:.0f} px."]
+        focal = f"{focal_mm:g} mm on its sensor"
     else:
         bad_value(f"K of {name}", "known", "no focal length in its EXIF", CURES)
+    notes = [Message("camera.from-exif", f"K of {name}: {focal} by its EXIF, {fx:.0f} px.")]
     if zoom > 1.01:
-        notes.append(f"{name} was zoomed digitally by {zoom:g}; some cameras do not count that in.")
+        sentence = f"{name} was zoomed digitally by {zoom:g}; some cameras do not count that in."
+        notes.append(Message("camera.zoom", sentence))
     return intrinsics(fx, fy, (width - 1) / 2, (height - 1) / 2), notes
 
 
@@ -218,10 +224,12 @@ def warn_of_other_lens(source: PathLike | Image.Image, K: np.ndarray, name: str)
     except InputError:
         return
     factor = K[0, 0] / theirs[0, 0]
-    if len(notes) == 1 and max(factor, 1 / factor) >= _OTHER_LENS:
+    zoomed = any(note.code == "camera.zoom" for note in notes)
+    if not zoomed and max(factor, 1 / factor) >= _OTHER_LENS:
         said = f"{factor:.2f} times the {theirs[0, 0]:.0f} px of its EXIF: is K for an image of another size?"
         cure = "If it is, all metres are off by that factor."
-        warn(f"K has a focal length of {K[0, 0]:.0f} px for {name}, {said} {cure}", stacklevel=3)
+        sentence = f"K has a focal length of {K[0, 0]:.0f} px for {name}, {said} {cure}"
+        warn(Message("camera.other-lens", sentence), stacklevel=3)
 
 
 def distortion_from_text(text: str, name: str = "--distortion") -> Distortion:

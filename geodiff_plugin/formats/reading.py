@@ -14,6 +14,7 @@ from geodiff_plugin._checks import bad_type, bad_value, check_number, warn
 from geodiff_plugin.formats import sfm, stereo
 from geodiff_plugin.formats.files import PathLike
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
+from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Rig
 
 _JSON = r"\A\s*[{\[]"
@@ -101,7 +102,8 @@ def _in_metres(rig: Rig, baseline_m: float | None, by_image: bool) -> Rig:
         if not by_image:
             return rig
         cure = "Give the measured distance of the two cameras as baseline_m (--baseline) to get metres."
-        warn(f"{rig.source} has no unit: depth comes out in the model's own. {cure}", stacklevel=3)
+        sentence = f"{rig.source} has no unit: depth comes out in the model's own. {cure}"
+        warn(Message("calibration.no-unit", sentence), stacklevel=3)
         return replace(rig, unit=None, measured=False)
     check_number(baseline_m, "baseline_m", float(np.finfo(np.float64).tiny), 1e9)
     length = float(np.linalg.norm(rig.E[:3, 3]))

@@ -30,6 +30,7 @@ from geodiff_plugin.formats.rigs import (
     transform,
     two_cameras,
 )
+from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Rig
 
 MM_PER_METRE, CM_PER_METRE = 1000.0, 100.0
@@ -73,7 +74,8 @@ def read_middlebury(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         cx = K_left[0, 2] + float(entries["doffs"])
         if not has_right or abs(K_right[0, 2] - cx) > DOFFS_TOLERANCE_PX:
             said = f"says cx = {K_right[0, 2]:g}" if has_right else "is missing"
-            warn(f"cam1 {said}; using cx0 + doffs = {cx:g} px for the right image.")
+            sentence = f"cam1 {said}; using cx0 + doffs = {cx:g} px for the right image."
+            warn(Message("calibration.doffs", sentence))
             K_right[0, 2] = cx
     size = entries.get("width"), entries.get("height")
     baseline_m = float(entries["baseline"]) / MM_PER_METRE
@@ -108,7 +110,7 @@ def _kitti_cameras(available: Collection[int], choice: CameraChoice) -> tuple[in
             return two_cameras(choice, have, pair)
     if len(pairs) > 1 and choice.cameras is None:
         which = "Of the grey pair 0,1 and the colour pair 2,3 of the calibration 2,3 is taken."
-        warn(f"{which} Give cameras (--cameras).")
+        warn(Message("calibration.kitti-cameras", f"{which} Give cameras (--cameras)."))
     return two_cameras(choice, have, pairs[-1])
 
 

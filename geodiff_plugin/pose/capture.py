@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
+from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.reconstruction import FEWEST_FOR_FOCAL, Match, Reconstruction, pycolmap
 
 #: Frames that a frame is matched with: so many after it, and so many others that look at the same place.
@@ -64,7 +65,7 @@ class SolvedCapture:
     scale_trajectory: float = 1.0  # factor from the adjusted lengths to those of the given positions
     scale_depth: float = 1.0  # the same to the depth of the scene under the given poses
     scale_spread: float = math.nan  # relative standard deviation of the scale in use
-    notes: tuple[str, ...] = ()  # sentences for the user
+    notes: tuple[Message, ...] = ()
 
     def pose(self, of: int, beside: int) -> np.ndarray:
         """``(4, 4)`` pose of frame ``beside`` in the frame of ``of``: both solved, or both as given."""
@@ -110,10 +111,11 @@ def solve_capture(
         base.extract(images)
         base.match(candidate_pairs(E, len(sizes)))
         blurred = np.flatnonzero(base.features < BLURRED_SHARE * np.median(base.features))
-        notes: list[str] = []
+        notes: list[Message] = []
         if len(blurred):
             these = _some_names([names[int(i)] for i in blurred])
-            notes.append(f"{these}: blurred or without texture; they are no good neighbours of others.")
+            sentence = f"{these}: blurred or without texture; they are no good neighbours of others."
+            notes.append(Message("capture.blurred", sentence))
         if E is None:
             result = _from_nothing(base, notes)
         else:
@@ -175,11 +177,12 @@ def _of_frames(matches: Sequence[Match], distances: Sequence[np.ndarray], count:
     return np.array([_median_px(p) if sum(map(len, p)) >= FEWEST_PER_FRAME else math.nan for p in parts])
 
 
-def _in_convention(base: Reconstruction, E: np.ndarray, notes: list[str]) -> np.ndarray:
+def _in_convention(base: Reconstruction, E: np.ndarray, notes: list[Message]) -> np.ndarray:
     """The given poses in our convention, found by the residuals of the matches."""
     matches = base.matches[:: max(1, len(base.matches) // 200)]
     if not matches:
-        notes.append("No two frames match: are they of one scene, and sharp? The poses were not checked.")
+        sentence = "No two frames match: are they of one scene, and sharp? The poses were not checked."
+        notes.append(Message("capture.no-matches", sentence))
         return E
     forms = {
         "as given": E,
@@ -191,7 +194,8 @@ def _in_convention(base: Reconstruction, E: np.ndarray, notes: list[str]) -> np.
     best = min(misfit, key=lambda name: misfit[name])
     if not misfit[best] < CONVENTION_GAIN * misfit["as given"]:
         return E
-    notes.append(f"The poses are read as {best}: as written, the matches contradict them.")
+    sentence = f"The poses are read as {best}: as written, the matches contradict them."
+    notes.append(Message("capture.convention", sentence))
     return forms[best]
 
 
@@ -211,7 +215,7 @@ def _misfit(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> float:
     return _median_px(_residuals_px(E, K, matches)) / max(ahead / max(count, 1), 0.05)
 
 
-def _from_given(base: Reconstruction, given: np.ndarray, notes: list[str], refine: bool) -> SolvedCapture:
+def _from_given(base: Reconstruction, given: np.ndarray, notes: list[Message], refine: bool) -> SolvedCapture:
     """Triangulate by the given poses, adjust, triangulate again; keep what is better, frame by frame."""
     matches = base.matches
     before = _residuals_px(given, base.K_given, matches)
@@ -227,11 +231,13 @@ def _from_given(base: Reconstruction, given: np.ndarray, notes: list[str], refin
     focal = len(base) >= FEWEST_FOR_FOCAL
     model = _adjusted(base, start, given, focal)
     if focal and np.abs(base.K(model)[:, 0, 0] / base.K_given[:, 0, 0] - 1).max() > MOST_FOCAL:
-        notes.append("The focal length that fits best is far from the given one, which is kept.")
+        sentence = "The focal length that fits best is far from the given one, which is kept."
+        notes.append(Message("capture.focal", sentence))
         model = _adjusted(base, started(), given, False)
     after = _residuals_px(base.poses(model), base.K(model), matches)
     if not _median_px(after) < LEAST_GAIN * as_given[0]:
-        notes.append(f"The given poses fit as well as any ({as_given[0]:.2f} px) and are kept.")
+        sentence = f"The given poses fit as well as any ({as_given[0]:.2f} px) and are kept."
+        notes.append(Message("capture.kept", sentence))
         return replace(_result(base, started(), "kept", given, as_given), E=given)
     result = _result(base, model, "solved", given, (as_given[0], _median_px(after)))
     worse = _of_frames(matches, after, len(base)) > _of_frames(matches, before, len(base))
@@ -342,34 +348,38 @@ def _result(
     )
 
 
-def _noted(result: SolvedCapture, notes: list[str], names: Sequence[str]) -> SolvedCapture:
+def _noted(result: SolvedCapture, notes: list[Message], names: Sequence[str]) -> SolvedCapture:
     """The capture with sentences on its scale and on frames that are not connected."""
     ratio, spread = result.scale_trajectory / result.scale_depth, result.scale_spread
     if abs(math.log(ratio)) > DISAGREES:
-        notes.append(
+        sentence = (
             "The given positions, and the depth of the scene under the given poses, give scales that are "
             f"{100 * abs(ratio - 1):.0f} % apart; their mean is used. Give --known-length for an exact one."
         )
+        notes.append(Message("capture.scales", sentence))
     if spread > DISAGREES:
-        notes.append(f"The scale is uncertain by {100 * spread:.0f} %: give --known-length for an exact one.")
+        sentence = f"The scale is uncertain by {100 * spread:.0f} %: give --known-length for an exact one."
+        notes.append(Message("capture.scale", sentence))
     if result.status == "solved" and result.E_given is not None:
         moved, size = result.moved()[0], np.linalg.norm(np.ptp(result.E_given[:, :3, 3], axis=0))
         least = max(FAR_TIMES * float(np.nanmedian(moved)), FAR_SHARE * float(size))
         far = result.connected & (moved > least)  # the others keep their poses
         if wrong := [name for name, is_far in zip(names, far, strict=True) if is_far]:
-            notes.append(
+            sentence = (
                 f"The given poses of {_some_names(wrong)} are far from where the pictures put these frames, "
                 "and are not used."
             )
+            notes.append(Message("capture.wrong-poses", sentence))
     lost = [name for name, connected in zip(names, result.connected, strict=True) if not connected]
     if lost and result.status != "given":
         kept = "have no pose and are skipped" if result.E_given is None else "keep their poses as given"
         kept = f"share too few points or fit worse when moved, and {kept}"
-        notes.append(f"{len(lost)} of {len(names)} frames {kept}: {_some_names(lost)}.")
+        sentence = f"{len(lost)} of {len(names)} frames {kept}: {_some_names(lost)}."
+        notes.append(Message("capture.unconnected", sentence))
     return replace(result, notes=tuple(notes))
 
 
-def _from_nothing(base: Reconstruction, notes: list[str]) -> SolvedCapture:
+def _from_nothing(base: Reconstruction, notes: list[Message]) -> SolvedCapture:
     """Structure from motion without given poses; the largest model."""
     models = base.from_nothing()
     if not models:
@@ -379,5 +389,6 @@ def _from_nothing(base: Reconstruction, notes: list[str]) -> SolvedCapture:
     there = np.isfinite(E).all((1, 2))
     after = _median_px(_residuals_px(E, K, [m for m in base.matches if there[[m[0], m[1]]].all()]))
     if len(models) > 1:
-        notes.append(f"{len(models)} parts are not connected; the largest is used.")
+        sentence = f"{len(models)} parts are not connected; the largest is used."
+        notes.append(Message("capture.parts", sentence))
     return _result(base, models[0], "estimated", None, (math.nan, after))

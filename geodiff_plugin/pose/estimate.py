@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value, check_number
+from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.solve import FREE_PX, SCALE_PX, PosePrior, solve_poses
 from geodiff_plugin.pose.tracks import (
     GreyImage,
@@ -43,9 +44,10 @@ APART_PX, SECOND_SHARE, SECOND_OF_REST, RIVAL = 6.0, 0.1, 0.5, 0.45
 _NARROWER_PX = (0.3, 0.15, 0.08)
 # The depth of a pixel is that of the matches this near, pixels of their grid.
 _NEAR_PX = 40.0
-NO_UNIT = (
+NO_UNIT = Message(
+    "scale.none",
     "No length is known, so the result has no unit: all depths are in baselines of the first two cameras. "
-    "Give their distance (baseline), a known length in the left photograph, or known points."
+    "Give their distance (baseline), a known length in the left photograph, or known points.",
 )
 
 
@@ -58,7 +60,7 @@ class EstimatedPose:
     parallax_deg: float  # median angle between the two rays of an inlier
     residual_px: float  # median distance of the inliers from their epipolar lines
     rectified: bool  # all rows agree
-    warnings: tuple[str, ...]  # sentences for the user
+    warnings: tuple[Message, ...]
 
 
 def _right_rays(tracks: Tracks) -> np.ndarray:
@@ -96,17 +98,19 @@ def estimate_pose(tracks: Tracks, name: str = "the two photographs") -> Estimate
     _check_parallax(tracks, near, parallax, name)
     warnings = _of_second_motion(tracks, T, inliers, name)
     if parallax < LITTLE_PARALLAX_DEG:
-        warnings.append(
+        sentence = (
             f"The parallax between {name} is {parallax:.2f} degrees in the median: depth rests on little. "
             "Move the camera further sideways."
         )
+        warnings.append(Message("estimate.parallax", sentence))
     left, right = (px[near].astype(np.float32) for px in (tracks.left_px, tracks.right_px[0]))
     on_plane = cv2.findHomography(left, right, cv2.RANSAC, INLIER_PX)[1]
     if on_plane is not None and on_plane.mean() > SIMPLER:
-        warnings.append(
+        sentence = (
             f"Nearly all matches of {name} lie on one plane: several poses explain them about as well. "
             "Take photographs with things at different depths, or give the pose."
         )
+        warnings.append(Message("estimate.plane", sentence))
     residual_px = float(np.median(residual[inliers]))
     return EstimatedPose(T, inliers, parallax, residual_px, sideways is not None, tuple(warnings))
 
@@ -158,7 +162,7 @@ def _five_points(tracks: Tracks) -> np.ndarray:
     return T
 
 
-def _of_second_motion(tracks: Tracks, T: np.ndarray, inliers: np.ndarray, name: str) -> list[str]:
+def _of_second_motion(tracks: Tracks, T: np.ndarray, inliers: np.ndarray, name: str) -> list[Message]:
     """Refuse, or report, a part of the scene that moved: a second pose explains its matches.
 
     Wrong matches are explained by no pose. What moves along its epipolar lines cannot be seen in two
@@ -179,10 +183,11 @@ def _of_second_motion(tracks: Tracks, T: np.ndarray, inliers: np.ndarray, name: 
     if count > RIVAL * inliers.sum():
         got = f"two motions, of {int(inliers.sum())} and {count} of its {len(tracks)} matches"
         bad_value(name, "of one scene that stands still", got, cure)
-    return [
+    sentence = (
         f"{100 * count / len(tracks):.0f} % of the matches of {name} follow a motion of their own: they lie "
         f"at wrong depths, and the pose may be wrong as well. {cure}"
-    ]
+    )
+    return [Message("estimate.second-motion", sentence)]
 
 
 def _rectified(tracks: Tracks, near: np.ndarray) -> np.ndarray | None:
@@ -245,7 +250,7 @@ class Scale:
     source: str  # "baseline", "known length", "points" or "none"
     factor: float  # 1 without a source
     spread: float | None = None  # relative standard error as the matches show, None where they cannot
-    warnings: tuple[str, ...] = ()  # sentences for the user
+    warnings: tuple[Message, ...] = ()
 
     @property
     def unit(self) -> str | None:

@@ -4,35 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from geodiff_plugin._camera_checks import FAR_SCENE_M, LONG_BASELINE_M
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
+from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
 
-INVERSE = (
+INVERSE = Message(
+    "pose.inverse",
     "The inverse pose explains the views better than the given one: are left and right swapped, "
-    "is the sign of the baseline wrong, or is E world-to-camera?"
+    "is the sign of the baseline wrong, or is E world-to-camera?",
 )
-_OPENGL = (
+_OPENGL = Message(
+    "pose.opengl",
     "The pose fits with the y and z axes of the cameras turned around: E seems to be in the axes of OpenGL "
-    "or Blender (y up, z backward). Give diag(1, -1, -1, 1) @ E @ diag(1, -1, -1, 1)."
+    "or Blender (y up, z backward). Give diag(1, -1, -1, 1) @ E @ diag(1, -1, -1, 1).",
 )
-_OPENGL_INVERSE = _OPENGL + " It also seems to be world-to-camera: invert it as well."
-_TRANSPOSED = "The pose fits with its rotation transposed: check the order of rows and columns in E."
-_KEPT_T = (
+_OPENGL_INVERSE = Message(
+    "pose.opengl-inverse", f"{_OPENGL} It also seems to be world-to-camera: invert it as well."
+)
+_TRANSPOSED = Message(
+    "pose.transposed",
+    "The pose fits with its rotation transposed: check the order of rows and columns in E.",
+)
+_KEPT_T = Message(
+    "pose.mixed",
     "The pose fits with its rotation as it is and its translation that of the inverse: "
-    "E mixes camera-to-world with world-to-camera."
+    "E mixes camera-to-world with world-to-camera.",
 )
-_K_SWAPPED = "The views fit with the two camera matrices exchanged: K seems to be (K_right, K_left)."
-_K_SCALED = (
-    "The views fit with K times {factor:g}: it seems to be for images of {size:.3g} times the width and "
-    "height of these. With s = {factor:g} take fx * s and (cx + 0.5) * s - 0.5, and likewise fy, cy."
-)
-_FOCAL_SCALED = (
-    "The views fit with the focal lengths times {factor:.3g} and the principal point as it is: K seems to be "
-    "for images of {size:.3g} times the width and height of these, its principal point set to the middle."
+_K_SWAPPED = Message(
+    "camera.swapped",
+    "The views fit with the two camera matrices exchanged: K seems to be (K_right, K_left).",
 )
 _FACTORS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 2, 2.0, 3.0, 4.0)
 # A match supports a pose if it lies in front of both cameras and this near to its epipolar line, pixels:
@@ -52,8 +57,20 @@ _ALIKE = 0.95
 #: A longer baseline, with a scene as far away, may be in centimetres or millimetres.
 SUSPECT_BASELINE_M = 5.0
 
-_Fit = tuple[tuple[float, ...], float]
-"""Shares of the matches that support a pose, coarsely and finely, and their median residual, pixels."""
+
+class _Fit(NamedTuple):
+    """How well matches support a pose."""
+
+    shares: tuple[float, ...]  # of the matches that do, coarsely and finely
+    median_px: float  # residual
+
+
+class _Candidate(NamedTuple):
+    """A mistake that might explain the misfit."""
+
+    mistake: Message
+    fit: _Fit  # without the mistake
+    far: bool  # whether the given pose is too far from that without the mistake to be merely inexact
 
 
 def _fit(tracks: Tracks, T: np.ndarray) -> _Fit:
@@ -61,10 +78,29 @@ def _fit(tracks: Tracks, T: np.ndarray) -> _Fit:
     ahead = (inverse_depth > 0) & ((tracks.rays @ T[2, :3] + inverse_depth * T[2, 3]) > 0)
     off_px = residuals_px(tracks, T[None])[0]
     shares = tuple(float((ahead & (off_px < near_px)).mean()) for near_px in _NEAR_PX)
-    return shares, float(np.median(off_px))
+    return _Fit(shares, float(np.median(off_px)))
 
 
-def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[str, Tracks, np.ndarray]]:
+def _scaled_K(factor: float) -> Message:
+    return Message(
+        "camera.scaled",
+        f"The views fit with K times {factor:g}: it seems to be for images of {1 / factor:.3g} times the "
+        f"width and height of these. With s = {factor:g} take fx * s and (cx + 0.5) * s - 0.5, and likewise "
+        "fy, cy.",
+    )
+
+
+def _scaled_focal(factor: float) -> Message:
+    return Message(
+        "camera.focal-scaled",
+        f"The views fit with the focal lengths times {factor:.3g} and the principal point as it is: K seems "
+        f"to be for images of {1 / factor:.3g} times the width and height of these, its principal point set "
+        "to the middle.",
+    )
+
+
+def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[Message, Tracks, np.ndarray]]:
+    """Every mistake, and the tracks and the pose as they would be without it."""
     inverse = np.linalg.inv(T)
     yield INVERSE, tracks, inverse
     yield _OPENGL, tracks, OPENGL_FROM_OPENCV @ T @ OPENGL_FROM_OPENCV
@@ -77,13 +113,13 @@ def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[str, Tracks, np
     if not np.allclose(tracks.K_left, tracks.K_rights[0], rtol=0.02):
         yield _K_SWAPPED, replace(tracks, K_left=tracks.K_rights[0], K_rights=tracks.K_left[None]), T
     for factor in _FACTORS:
-        for sentence in (_K_SCALED, _FOCAL_SCALED):
-            Ks = np.stack([tracks.K_left, *tracks.K_rights])
-            Ks[:, :2, :2] *= factor
-            if sentence == _K_SCALED:
-                Ks[:, :2, 2] = (Ks[:, :2, 2] + 0.5) * factor - 0.5
-            text = sentence.format(factor=factor, size=1 / factor)
-            yield text, replace(tracks, K_left=Ks[0], K_rights=Ks[1:]), T
+        Ks = np.stack([tracks.K_left, *tracks.K_rights])
+        Ks[:, :2, :2] *= factor
+        focal = replace(tracks, K_left=Ks[0], K_rights=Ks[1:])
+        Ks = Ks.copy()
+        Ks[:, :2, 2] = (Ks[:, :2, 2] + 0.5) * factor - 0.5
+        yield _scaled_K(factor), replace(tracks, K_left=Ks[0], K_rights=Ks[1:]), T
+        yield _scaled_focal(factor), focal, T
 
 
 def pose_change(given: np.ndarray, Ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -94,42 +130,40 @@ def pose_change(given: np.ndarray, Ts: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return np.degrees(np.arccos(np.clip(cosines, -1, 1))), shifts
 
 
-def _likeliest(tracks: Tracks, T: np.ndarray) -> tuple[str, _Fit, bool]:
-    """The mistake with the largest share of matches; among similar ones that with the best fine fit.
-
-    Also its fit, and whether the given pose is too far from it to be merely inexact.
-    """
+def _likeliest(tracks: Tracks, T: np.ndarray) -> _Candidate:
+    """The mistake with the largest share of matches; among similar ones that with the best fine fit."""
     candidates = []
-    for sentence, changed, pose in _candidates(tracks, T):
+    for mistake, changed, pose in _candidates(tracks, T):
         (turned_deg,), (shift,) = pose_change(T[None], pose[None])
         far = changed is not tracks or turned_deg >= _FAR_DEG or shift >= _FAR_SHIFT
-        candidates.append((sentence, _fit(changed, pose), bool(far)))
+        candidates.append(_Candidate(mistake, _fit(changed, pose), bool(far)))
     for level in range(len(_NEAR_PX)):
-        largest = max(fit[0][level] for _, fit, _ in candidates)
-        candidates = [each for each in candidates if each[1][0][level] >= _ALIKE * largest]
-    return min(candidates, key=lambda each: each[1][1])
+        largest = max(each.fit.shares[level] for each in candidates)
+        candidates = [each for each in candidates if each.fit.shares[level] >= _ALIKE * largest]
+    return min(candidates, key=lambda each: each.fit.median_px)
 
 
-def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> str | None:
-    """A sentence on the mistake that would make the matches of one right view fit, or ``None``.
+def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> Message | None:
+    """The mistake that would make the matches of one right view fit, or ``None``.
 
     ``T (4, 4)`` is ``T_right_from_left`` as given, ``near`` the pose near it that fits best: where only
     that fits, the pose is inexact.
     """
-    given, nearby = _fit(tracks, T)[0], _fit(tracks, near)
-    sentence, (shares, median_px), far = _likeliest(tracks, T)
-    if any(share <= _NEARLY * other for share, other in zip(shares, nearby[0], strict=True)):
+    given, nearby = _fit(tracks, T), _fit(tracks, near)
+    mistake, fit, far = _likeliest(tracks, T)
+    if any(share <= _NEARLY * other for share, other in zip(fit.shares, nearby.shares, strict=True)):
         return None
     coarsely, finely = (
-        share > max(_AT_LEAST, _CLEARLY * other) for share, other in zip(shares, given, strict=True)
+        share > max(_AT_LEAST, _CLEARLY * other)
+        for share, other in zip(fit.shares, given.shares, strict=True)
     )
-    exactly = median_px <= _AS_EXACT * nearby[1]
+    exactly = fit.median_px <= _AS_EXACT * nearby.median_px
     clear = (exactly or far) if coarsely else (finely and exactly and far)
-    return sentence if clear else None
+    return mistake if clear else None
 
 
-def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:
-    """A sentence where baseline and scene are both a hundred or a thousand times too large, or ``None``.
+def implausible_unit(tracks: Tracks, T: np.ndarray) -> Message | None:
+    """A message where baseline and scene are both a hundred or a thousand times too large, or ``None``.
 
     Only the resulting depths show the unit of a translation. ``check_baseline`` has warned of baselines above
     ``LONG_BASELINE_M``. Nearer scenes pass: a drone 100 m up has such baselines.
@@ -142,7 +176,8 @@ def implausible_unit(tracks: Tracks, T: np.ndarray) -> str | None:
     depth_m = float(np.median(1.0 / inverse_depth[ahead]))
     if depth_m < FAR_SCENE_M or depth_m / baseline > 200.0:
         return None
-    return (
+    return Message(
+        "pose.unit",
         f"With a baseline of {baseline:.4g} m the matches lie {depth_m:.0f} m away in the median. "
-        "If the translation is in centimetres, divide it by 100; if it is in millimetres, by 1000."
+        "If the translation is in centimetres, divide it by 100; if it is in millimetres, by 1000.",
     )

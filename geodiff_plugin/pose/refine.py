@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit, pose_change
 from geodiff_plugin.pose.solve import is_rig, nearby_poses, settle_poses
 from geodiff_plugin.pose.tracks import (
@@ -90,8 +91,8 @@ def refine_views(
     fits_px = FITS_PX if rig else POSED_FITS_PX
     misfit = bool((before > fits_px).any())
     near = nearby_poses(sparse, given, before) if misfit else given
-    units = _sentences(sparse, implausible_unit, given) if unit == "m" else ()
-    if mistakes := _sentences(sparse, find_mistake, given, near):
+    units = _messages(sparse, implausible_unit, given) if unit == "m" else ()
+    if mistakes := _messages(sparse, find_mistake, given, near):
         return tuple(rights), replace(report, status="mistaken", warnings=mistakes)
     if not misfit:
         return tuple(rights), replace(report, warnings=units)
@@ -104,10 +105,15 @@ def refine_views(
     report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
     doubts = undecided(tracks, Ts, free)
     if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
-        sentences = _misfit(before, worst, ", and no pose near it leaves clearly less. ")
-        return tuple(rights), replace(report, status="kept", warnings=sentences + doubts + units)
-    if far := _too_far(before, after, *pose_change(given, Ts)):
-        return tuple(rights), replace(report, status="kept", warnings=(*filter(None, far), *units))
+        return tuple(rights), replace(
+            report, status="kept", warnings=_kept_misfit(before, worst) + doubts + units
+        )
+    turned_deg, shifts = pose_change(given, Ts)
+    far = ~((turned_deg < _MOST_TURN_DEG) & (shifts < _MOST_SHIFT))
+    if far.any():
+        v = int(np.lexsort((np.nan_to_num(before), far & ~np.isnan(before)))[-1])  # the worst of the far ones
+        warnings = _too_far(before, after, v, turned_deg[v], shifts[v])
+        return tuple(rights), replace(report, status="kept", warnings=warnings + units)
     Ts, spread = (Ts, None) if rig or measured else _rescaled(tracks, given, Ts, before)
     bends = [
         None if not before[v] > fits_px else fit_displacement(tracks.view(v), T, views[v + 1][0].shape)
@@ -118,7 +124,7 @@ def refine_views(
     report = replace(
         report,
         status="refined",
-        warnings=_misfit(before, worst, f", a refined one {after[worst]:.1f} px. ") + doubts + units,
+        warnings=_refined_misfit(before, after, worst) + doubts + units,
         scale_spread=spread,
         E=_as_E(Ts),
         residual_px=tuple(median_residuals(replace(tracks, right_px=straight), Ts).tolist()),
@@ -258,45 +264,59 @@ def _applied(
     )
 
 
-def _sentences(tracks: Tracks, ask: Callable[..., str | None], *poses: np.ndarray) -> tuple[str, ...]:
-    """The sentences of ``ask`` about every view that has matches, each once."""
+def _messages(
+    tracks: Tracks, check: Callable[..., Message | None], *poses: np.ndarray
+) -> tuple[Message, ...]:
+    """What ``check`` says of every view that has matches, each message once."""
     views = [(tracks.view(v), *of_view) for v, of_view in enumerate(zip(*poses, strict=True))]
-    sentences = [ask(*view) for view in views if len(view[0]) >= FEWEST]
-    return tuple(dict.fromkeys(sentence for sentence in sentences if sentence))
+    found = [check(*view) for view in views if len(view[0]) >= FEWEST]
+    return distinct(message for message in found if message is not None)
 
 
-def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[str, ...]:
-    """A sentence where the matches do not determine the pose, and with it the depth."""
+def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[Message, ...]:
+    """A message where the matches do not determine the pose, and with it the depth."""
     used, other = (solve_inverse_depth(tracks, poses) for poses in (Ts, free))
     ahead = (used > 0) & (other > 0)
     spread = float(np.median(np.abs(np.log(used[ahead] / other[ahead])))) if ahead.any() else 0.0
     if spread < _MOST_SPREAD:
         return ()
-    return (
+    sentence = (
         "The matches do not determine the pose: another one fits them as well, and its depths differ by "
-        f"{100 * np.expm1(spread):.0f} % in the median. Give a more exact pose, or views from further apart.",
+        f"{100 * np.expm1(spread):.0f} % in the median. Give a more exact pose, or views from further apart."
     )
+    return (Message("pose.undetermined", sentence),)
 
 
-def _misfit(before: np.ndarray, v: int, rest: str) -> tuple[str, ...]:
-    """A sentence on the misfit of view ``v``, with ``rest`` and likely causes; none if no misfit is large."""
+def _misses(before: np.ndarray, v: int) -> str | None:
+    """How far view ``v``'s pose as given misses the matches; ``None`` if no view is worth a warning."""
     if not np.nanmax(before) > WARNS_PX:
-        return ()
+        return None
     pose = "The pose as given" if len(before) == 1 else f"The pose of right view {v + 1} as given"
-    leaves = f"{pose} leaves matches {before[v]:.1f} px off their epipolar lines in the median"
-    return (f"{leaves}{rest}{_CAUSES}",)
+    return f"{pose} leaves matches {before[v]:.1f} px off their epipolar lines in the median"
+
+
+def _kept_misfit(before: np.ndarray, v: int) -> tuple[Message, ...]:
+    misses = _misses(before, v)
+    if misses is None:
+        return ()
+    return (Message("pose.kept", f"{misses}, and no pose near it leaves clearly less. {_CAUSES}"),)
+
+
+def _refined_misfit(before: np.ndarray, after: np.ndarray, v: int) -> tuple[Message, ...]:
+    misses = _misses(before, v)
+    if misses is None:
+        return ()
+    return (Message("pose.refined", f"{misses}, a refined one {after[v]:.1f} px. {_CAUSES}"),)
 
 
 def _too_far(
-    before: np.ndarray, after: np.ndarray, turned_deg: np.ndarray, shifts: np.ndarray
-) -> tuple[str, ...]:
-    """A sentence on poses too far from the given ones to be used, maybe empty; ``()`` if none is too far."""
-    far = ~((turned_deg < _MOST_TURN_DEG) & (shifts < _MOST_SHIFT))
-    if not far.any():
+    before: np.ndarray, after: np.ndarray, v: int, turned_deg: float, shift: float
+) -> tuple[Message, ...]:
+    misses = _misses(before, v)
+    if misses is None:
         return ()
-    v = int(np.lexsort((np.nan_to_num(before), far & ~np.isnan(before)))[-1])  # the worst of those too far
     rest = (
-        f". A pose {turned_deg[v]:.0f} degrees and {100 * shifts[v]:.0f} % of the baseline away fits to "
-        f"{after[v]:.1f} px, but is too far from the given one and was not used. "
+        f"A pose {turned_deg:.0f} degrees and {100 * shift:.0f} % of the baseline away fits to "
+        f"{after[v]:.1f} px, but is too far from the given one and was not used."
     )
-    return _misfit(before, v, rest) or ("",)
+    return (Message("pose.too-far", f"{misses}. {rest} {_CAUSES}"),)

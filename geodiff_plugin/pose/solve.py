@@ -16,6 +16,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin.geometry import is_rectified
+from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.tracks import (
     Projected,
     Tracks,
@@ -268,12 +269,13 @@ def depth_spread(tracks: Tracks, Ts: np.ndarray) -> float:
     return float(np.median(np.einsum("np,pq,nq->n", by_step, covariance, by_step)) ** 0.5)
 
 
-def undetermined_pose(spread: float | None) -> tuple[str, ...]:
-    """A sentence where the matches do not determine an estimated pose; none for ``None``."""
+def undetermined_pose(spread: float | None) -> tuple[Message, ...]:
+    """A message where the matches do not determine an estimated pose; none for ``None``."""
     if spread is None or spread <= MOST_SPREAD:
         return ()
-    return (
+    sentence = (
         "The matches do not determine the estimated pose: by it alone depths may be off by "
         f"{100 * spread:.0f} % (one standard deviation). Take photographs that show more texture or are "
-        "further apart, or give the pose.",
+        "further apart, or give the pose."
     )
+    return (Message("estimate.undetermined", sentence),)

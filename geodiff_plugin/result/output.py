@@ -19,8 +19,8 @@ from geodiff_plugin.algorithm.correction import correction_target, fit_depth
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.geometry import image_size, resize_intrinsics
 from geodiff_plugin.matching import Matches, build_cost_volume, match_volume
+from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.estimate import NO_UNIT
-from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.result.confidence import depth_confidence, reprojection
 from geodiff_plugin.result.full_resolution import sharpen_edges, vote_depth
 from geodiff_plugin.result.verdict import Indicators, Verdict, judge, points_agreement, read_indicators
@@ -124,11 +124,11 @@ def assemble_output(
     run: GuidedRun,
     guidance: GeometryGuidance,
     call: Mapping[str, Any],
-    warned: Mapping[str, bool],
+    warned: Sequence[Message],
 ) -> MetricDepthOutput:
     """``MetricDepthOutput`` without ``latent``, from the stock call's output, whose maps are in metres.
 
-    ``warned`` has the warnings so far, and whether each of them makes the result untrusted.
+    ``warned`` are the warnings so far; those that forbid trust are reasons of the verdict.
     """
     natives = [evidence.native_left for evidence in run.evidence]
     # A single large picture is not copied.
@@ -153,7 +153,7 @@ def assemble_output(
         confidence = depth_confidence(support, *seen, spread, prior_error)
     relative = torch.cat(run.relative)
     relative = median(relative.reshape(count, -1, *relative.shape[1:]), 1)  # (N, 1, h, w)
-    doubts = tuple(sentence for sentence, forbids in warned.items() if forbids)
+    doubts = tuple(message for message in warned if message.forbids_trust)
     known: dict[str, Any] = {"doubts": doubts, "has_unit": has_unit}
     maps = relative, confidence, over_prior if has_unit else None
     verdicts = [judge(_indicators(run, i, K, depth_m[i], *maps, **known)) for i, K in enumerate(Ks)]
@@ -192,7 +192,7 @@ def assemble_output(
         warnings=[
             *_warnings(run, visible, verdicts),
             *(() if estimated is None else estimated.warnings),
-            *(sentence for sentence, forbids in warned.items() if not forbids),  # doubts are reasons already
+            *(message for message in warned if not message.forbids_trust),  # the others are reasons already
         ],
         assumed=list(guidance.assumed),
     )
@@ -236,9 +236,10 @@ def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> Metr
     def moved(E: np.ndarray) -> np.ndarray:
         return np.block([[E[:3, :3], factor * E[:3, 3:]], [E[3:]]])
 
-    warning = (
+    warning = Message(
+        "scale.from-prior",
         "No length is known: the metres are the prior's own, with its errors. Its depth and the depth from "
-        f"the views differ by {100 * spread:.0f} % in the median."
+        f"the views differ by {100 * spread:.0f} % in the median.",
     )
     output.prediction = output.prediction * factor
     output.uncertainty = None if output.uncertainty is None else output.uncertainty * factor
@@ -250,7 +251,7 @@ def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> Metr
         for pose in output.poses
     ]
     output.unit, output.scale_from, output.scale_spread, output.rescaled = "m", "prior", spread, factor
-    output.warnings = [sentence for sentence in output.warnings if sentence != NO_UNIT] + [warning]
+    output.warnings = [m for m in output.warnings if m.code != NO_UNIT.code] + [warning]
     return output
 
 
@@ -296,18 +297,19 @@ def image_labels(count: int) -> list[str]:
     return [""] if count == 1 else [f"Image {i}: " for i in range(1, count + 1)]
 
 
-def _warnings(run: GuidedRun, visible: Tensor | None, verdicts: Sequence[Verdict]) -> list[str]:
+def _warnings(run: GuidedRun, visible: Tensor | None, verdicts: Sequence[Verdict]) -> list[Message]:
     warnings = []
     for i, (label, verdict) in enumerate(zip(image_labels(len(verdicts)), verdicts, strict=True)):
-        sentences = [] if verdict.trusted else [verdict.sentence]
-        sentences += verdict.remarks
+        messages = [] if verdict.message is None else [verdict.message]
+        messages += verdict.remarks
         share = 1.0 if visible is None else visible[i].float().mean().item()
         if share < LITTLE_OVERLAP:
-            sentences.append(
+            sentence = (
                 f"Only {share:.0%} of the left image is seen by a right camera at this depth; "
                 "few pixels determine the scale."
             )
-        reasons = {INVERSE, *verdict.indicators.mistakes}  # mistakes of a pose are in the verdict already
-        sentences += [sentence for sentence in run.evidence[i].warnings if sentence not in reasons]
-        warnings += [label + sentence for sentence in sentences]
+            messages.append(Message("views.overlap", sentence))
+        # Mistakes of a pose are reasons of the verdict already.
+        messages += [message for message in run.evidence[i].warnings if not message.forbids_trust]
+        warnings += [message.labelled(label) for message in messages]
     return warnings

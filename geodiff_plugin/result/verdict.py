@@ -6,6 +6,7 @@ No indicator shows a wrong focal length of a rectified pair, or a wrong baseline
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ from torch import Tensor
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.matching import Matches
+from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.mistakes import INVERSE
 
 #: Matches above this confidence count.
@@ -101,8 +103,8 @@ class Indicators:
     given_px: float = math.nan  # the same distance under the poses as given
     scale_spread: float = math.nan  # relative standard deviation of a refined pose's scale, if in metres
     off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
-    doubts: tuple[str, ...] = ()  # warnings about the input, each of which forbids trust
-    mistakes: tuple[str, ...] = ()  # of a given pose, that would explain its misfit (``pose.mistakes``)
+    doubts: tuple[Message, ...] = ()  # warnings about the input, each of which forbids trust
+    mistakes: tuple[Message, ...] = ()  # of a given pose, that would explain its misfit (``pose.mistakes``)
     flat: bool = False  # all confident matches lie within two planes, and near enough to mean something
     same: bool = False  # the left and a right view are the same picture
     inverse_fits: bool = False  # the inverse pose matches clearly more
@@ -114,16 +116,23 @@ class Verdict:
     """Whether one image's depth can be trusted."""
 
     status: str  # "trusted", "not trusted", or "not judged": there was nothing to compare it with
-    reasons: tuple[str, ...]  # sentences on what speaks against it, the likeliest cause first
-    remarks: tuple[str, ...]  # on what is unusual but may be right
+    reasons: tuple[Message, ...]  # what speaks against it, the likeliest cause first
+    remarks: tuple[Message, ...]  # what is unusual but may be right
     indicators: Indicators
 
     @property
-    def sentence(self) -> str:
-        """A sentence for the user; empty where it is trusted."""
+    def message(self) -> Message | None:
+        """The verdict for the user; ``None`` where it is trusted."""
+        if self.trusted:
+            return None
         if self.status == "not judged":
-            return f"This depth was not judged: {UNTESTED}."
-        return "" if self.trusted else f"Do not trust this depth: {' '.join(self.reasons)}"
+            return Message("verdict.not-judged", f"This depth was not judged: {UNTESTED}.")
+        return Message("verdict.not-trusted", f"Do not trust this depth: {' '.join(self.reasons)}")
+
+    @property
+    def sentence(self) -> str:
+        """The sentence of ``message``; empty where it is trusted."""
+        return self.message or ""
 
     @property
     def trusted(self) -> bool:
@@ -199,7 +208,7 @@ def read_indicators(
         for name, residuals in (("epipolar_px", pose.residual_px), ("given_px", pose.residual_px_given)):
             more[name] = max((px for px in residuals if not math.isnan(px)), default=math.nan)
         if pose.status == "mistaken":
-            more["mistakes"] = tuple(sentence for sentence in pose.warnings if sentence != INVERSE)
+            more["mistakes"] = tuple(m for m in pose.warnings if m.code != INVERSE.code)
     if evidence.points is not None:
         known = (evidence.points.confidence > 0).float()
         more |= {"points": int(known.sum()), "cover": float(F.adaptive_max_pool2d(known, 8).mean())}
@@ -211,129 +220,25 @@ def read_indicators(
         **more,
         view_deg=2.0 * math.degrees(math.atan(0.5 * width / float(K_left[0, 0]))),
         same=any(_alike(view.image_01, evidence.native_left) for view in rights),
-        inverse_fits=INVERSE in evidence.warnings,
+        inverse_fits=any(message.code == INVERSE.code for message in evidence.warnings),
     )
 
 
-def points_agreement(run: Indicators) -> float:
+def points_agreement(found: Indicators) -> float:
     """How well points and views agree, [0.25, 1]: what the confidence is multiplied by."""
-    if math.isnan(run.points_ratio):
+    if math.isnan(found.points_ratio):
         return 1.0
-    off = abs(math.log(run.points_ratio))
+    off = abs(math.log(found.points_ratio))
     return min(1.0, max(0.25, 1.0 - 0.75 * (off - POINTS_REPORTED) / (POINTS_WRONG - POINTS_REPORTED)))
 
 
-def _why_points(run: Indicators) -> str:
-    """A sentence on points that differ from the views; empty where they agree."""
-    ratio = run.points_ratio
-    if math.isnan(ratio):
-        return ""
-    if abs(math.log(ratio)) < POINTS_REPORTED:
-        if not run.points_off > MANY_OFF:
-            return ""
-        return (
-            f"{100 * run.points_off:.0f} % of the known depths contradict what both views match there, and "
-            "the result follows them: give them a confidence (points_confidence, --points-confidence), or "
-            "leave them out."
-        )
-    causes = [text for factor, text in FACTORS.items() if abs(math.log(ratio / factor)) < NEARLY]
-    cause = causes[0] if causes else "a unit, the baseline or K is wrong, or the points are in another frame"
-    return f"The points lie {float(f'{ratio:.3g}'):g} times as far as what both views match: {cause}."
+@dataclass(frozen=True)
+class Rule:
+    """A message that indicators may call for."""
 
-
-def _points_wrong(run: Indicators) -> bool:
-    return _log(run.points_ratio) > POINTS_WRONG or run.points_off > MOST_OFF
-
-
-def _why_order(run: Indicators) -> str:
-    varied = not run.spread < LEAST_SPREAD
-    if run.order < LEAST_ORDER and math.isnan(run.matched):  # known points alone
-        return (
-            f"The prior and the known depths disagree on near and far (rank correlation {run.order:+.2f}): "
-            "are they metres along z in the left camera's frame, and is the space of the prior right?"
-        )
-    if run.inverse_fits or (run.order < MOST_EXCHANGED and varied):
-        return (
-            "Near and far are exchanged against the prior, or the inverse pose fits better: are left and "
-            "right swapped, is the sign of the baseline wrong, is E world-to-camera, or is a prior map of "
-            "another space (--space)?"
-        )
-    if run.order < LEAST_ORDER and varied and not run.matched > MATCHED_ENOUGH:
-        return (
-            f"The prior and the matches hardly agree on near and far (rank correlation {run.order:+.2f}): "
-            "is E, K or the order of the images wrong, or is the right image of something else?"
-        )
-    return ""
-
-
-def _why_matches(run: Indicators) -> str:
-    if math.isnan(run.matched):  # known points alone: nothing that a second view could be wrong about
-        return ""
-    few = run.matched < LEAST_MATCHED
-    weak = (run.matched < WEAK_MATCHED, run.confidence < WEAK_CONFIDENCE, run.order < WEAK_ORDER)
-    count = sum(weak) + (run.epipolar_px > WEAK_EPIPOLAR_PX)
-    if not (few or run.confidence < LEAST_CONFIDENCE or count > 1):
-        return ""
-    shares = [f"{100 * run.matched:.0f} % of the left image is matched"] if few or weak[0] else []
-    shares += [f"the mean confidence is {run.confidence:.2f}"] if weak[1] else []
-    shares += [f"the rank correlation with the prior is {run.order:.2f}"] if weak[2] and not shares else []
-    return (
-        f"The views hardly agree: {' and '.join(shares)}. Likely causes: E along the wrong axis or with a "
-        "wrong rotation, images that are not rectified or whose lens is not corrected, K of another size, a "
-        "mirrored image, or views of different scenes or moments."
-    )
-
-
-def _lines(run: Indicators) -> str:
-    return (
-        f"Matches lie {run.epipolar_px:.1f} px off their epipolar lines, and no pose near the given one "
-        "brings them closer: are the images rectified, the poses right, and K for these images?"
-    )
-
-
-def _reasons(run: Indicators) -> list[str]:
-    if run.same:
-        return ["The left and a right view are the same picture, pixel by pixel; two places are needed."]
-    order, reasons = _why_order(run), list(run.doubts)
-    if 0 < run.baseline_m < LEAST_BASELINE_M:
-        reasons.append(
-            f"The baseline is {1000 * run.baseline_m:.3g} mm: was it divided by 1000 once too often? "
-            "Baselines and poses are in metres."
-        )
-    if run.inverse_fits:  # explains what the pose's other mistakes only describe
-        reasons.append(order)
-    reasons += run.mistakes
-    if run.flat:
-        reasons.append(
-            "All matches have one depth: the right image looks like a shifted copy of the left one. (Of a "
-            "flat wall seen head-on it may be true.)"
-        )
-    if run.at_end > TOO_MANY_AT_END:
-        reasons.append(
-            f"{100 * run.at_end:.0f} % of the matches lie at an end of the range of depths: the scene "
-            "reaches beyond it. Widen depth_range (--near, --far)."
-        )
-    if _points_wrong(run):
-        reasons.append(_why_points(run))
-    if 0 < run.points < LEAST_POINTS and math.isnan(run.matched):
-        reasons.append(
-            f"Too few known depths to fix scale and shift: {run.points}; give at least {LEAST_POINTS}."
-        )
-    if run.scale_spread > MOST_SCALE_SPREAD and run.points < LEAST_POINTS:
-        misses = f"E misses the matches by {run.given_px:.0f} px: is it of this pair? "
-        reasons.append(
-            f"{misses if run.given_px > EPIPOLAR_WRONG else ''}The scale of the refined pose is uncertain by "
-            f"{100 * min(run.scale_spread, 1):.0f} %: the baseline and the depth of the scene under the "
-            "given pose disagree. Give the measured distance of the cameras (--baseline, "
-            f"measured_baseline=True), or {LEAST_POINTS} known points or more."
-        )
-    if run.off_matches > OFF_MATCHES and run.points < LEAST_POINTS:
-        reasons.append(
-            f"The depth differs by {100 * math.expm1(run.off_matches):.0f} %, in the median, from what both "
-            "views match: the scale or the shift was not found."
-        )
-    reasons += ["" if run.inverse_fits else order, _lines(run) if run.epipolar_px > EPIPOLAR_WRONG else ""]
-    return [sentence for sentence in (*reasons, _why_matches(run)) if sentence]
+    code: str  # of ``geodiff_plugin.messages``
+    applies: Callable[[Indicators], bool]
+    sentence: Callable[[Indicators], str]
 
 
 def _log(ratio: float) -> float:
@@ -341,36 +246,255 @@ def _log(ratio: float) -> float:
     return abs(math.log(ratio)) if ratio > 0 else 0.0
 
 
-def _remarks(run: Indicators, trusted: bool) -> list[str]:
-    remarks = []
-    if run.view_deg < VIEWS_DEG[0] or run.view_deg > VIEWS_DEG[1]:
-        remarks.append(
-            f"K gives the left image a field of view of {run.view_deg:.0f} degrees: is it for an image of "
+def _by_points_alone(found: Indicators) -> bool:
+    """Whether there is no second view that could be matched, or be wrong."""
+    return math.isnan(found.matched)
+
+
+def _depths_vary(found: Indicators) -> bool:
+    """Whether the order of near and far means something; an unknown spread counts as a wide one."""
+    return math.isnan(found.spread) or found.spread >= LEAST_SPREAD
+
+
+def _well_matched(found: Indicators) -> bool:
+    """Whether so much is matched that a low rank correlation is rather the prior's fault."""
+    return found.matched > MATCHED_ENOUGH
+
+
+def _points_wrong(found: Indicators) -> bool:
+    return _log(found.points_ratio) > POINTS_WRONG or found.points_off > MOST_OFF
+
+
+def _points_differ_by_a_factor(found: Indicators) -> bool:
+    return _log(found.points_ratio) >= POINTS_REPORTED
+
+
+def _points_contradict(found: Indicators) -> bool:
+    return not _points_differ_by_a_factor(found) and found.points_off > MANY_OFF
+
+
+def _exchanged(found: Indicators) -> bool:
+    return found.order < MOST_EXCHANGED and _depths_vary(found) and not _by_points_alone(found)
+
+
+def _hardly_ordered(found: Indicators) -> bool:
+    low = MOST_EXCHANGED <= found.order < LEAST_ORDER and not found.inverse_fits
+    return low and _depths_vary(found) and not (_by_points_alone(found) or _well_matched(found))
+
+
+def _weaknesses(found: Indicators) -> tuple[bool, bool, bool]:
+    """Whether share matched, confidence and rank correlation are weak."""
+    return found.matched < WEAK_MATCHED, found.confidence < WEAK_CONFIDENCE, found.order < WEAK_ORDER
+
+
+def _views_disagree(found: Indicators) -> bool:
+    if _by_points_alone(found):
+        return False
+    weak = sum(_weaknesses(found)) + (found.epipolar_px > WEAK_EPIPOLAR_PX)
+    return found.matched < LEAST_MATCHED or found.confidence < LEAST_CONFIDENCE or weak > 1
+
+
+def _scale_uncertain(found: Indicators) -> bool:
+    return found.scale_spread > MOST_SCALE_SPREAD and found.points < LEAST_POINTS
+
+
+def _why_exchanged(_: Indicators) -> str:
+    return (
+        "Near and far are exchanged against the prior, or the inverse pose fits better: are left and "
+        "right swapped, is the sign of the baseline wrong, is E world-to-camera, or is a prior map of "
+        "another space (--space)?"
+    )
+
+
+def _why_factor(found: Indicators) -> str:
+    ratio = found.points_ratio
+    causes = [text for factor, text in FACTORS.items() if abs(math.log(ratio / factor)) < NEARLY]
+    cause = causes[0] if causes else "a unit, the baseline or K is wrong, or the points are in another frame"
+    return f"The points lie {float(f'{ratio:.3g}'):g} times as far as what both views match: {cause}."
+
+
+def _why_contradicted(found: Indicators) -> str:
+    return (
+        f"{100 * found.points_off:.0f} % of the known depths contradict what both views match there, and the "
+        "result follows them: give them a confidence (points_confidence, --points-confidence), or leave them "
+        "out."
+    )
+
+
+def _why_scale(found: Indicators) -> str:
+    misses = f"E misses the matches by {found.given_px:.0f} px: is it of this pair? "
+    return (
+        f"{misses if found.given_px > EPIPOLAR_WRONG else ''}The scale of the refined pose is uncertain by "
+        f"{100 * min(found.scale_spread, 1):.0f} %: the baseline and the depth of the scene under the given "
+        "pose disagree. Give the measured distance of the cameras (--baseline, measured_baseline=True), or "
+        f"{LEAST_POINTS} known points or more."
+    )
+
+
+def _why_off_lines(found: Indicators) -> str:
+    return (
+        f"Matches lie {found.epipolar_px:.1f} px off their epipolar lines, and no pose near the given one "
+        "brings them closer: are the images rectified, the poses right, and K for these images?"
+    )
+
+
+def _why_disagreement(found: Indicators) -> str:
+    few, unsure, unordered = _weaknesses(found)
+    shares = [f"{100 * found.matched:.0f} % of the left image is matched"] if few else []
+    shares += [f"the mean confidence is {found.confidence:.2f}"] if unsure else []
+    shares += (
+        [f"the rank correlation with the prior is {found.order:.2f}"] if unordered and not shares else []
+    )
+    return (
+        f"The views hardly agree: {' and '.join(shares)}. Likely causes: E along the wrong axis or with a "
+        "wrong rotation, images that are not rectified or whose lens is not corrected, K of another size, a "
+        "mirrored image, or views of different scenes or moments."
+    )
+
+
+#: Without any other reason: nothing else that is wrong with them matters.
+SAME_PICTURE = Message(
+    "views.same", "The left and a right view are the same picture, pixel by pixel; two places are needed."
+)
+#: Reasons in the order in which they are told: those that explain a pose's mistakes, which only describe
+#: (``Indicators.mistakes``), come before them, and the others after them.
+EXPLAINING = (
+    Rule(
+        "baseline.short",
+        lambda found: 0 < found.baseline_m < LEAST_BASELINE_M,
+        lambda found: (
+            f"The baseline is {1000 * found.baseline_m:.3g} mm: was it divided by 1000 once too often? "
+            "Baselines and poses are in metres."
+        ),
+    ),
+    Rule("depth.exchanged", lambda found: found.inverse_fits, _why_exchanged),
+)
+REASONS = (
+    Rule(
+        "views.shifted",
+        lambda found: found.flat,
+        lambda _: (
+            "All matches have one depth: the right image looks like a shifted copy of the left one. (Of a "
+            "flat wall seen head-on it may be true.)"
+        ),
+    ),
+    Rule(
+        "depth.range",
+        lambda found: found.at_end > TOO_MANY_AT_END,
+        lambda found: (
+            f"{100 * found.at_end:.0f} % of the matches lie at an end of the range of depths: the scene "
+            "reaches beyond it. Widen depth_range (--near, --far)."
+        ),
+    ),
+    Rule(
+        "points.factor",
+        lambda found: _points_wrong(found) and _points_differ_by_a_factor(found),
+        _why_factor,
+    ),
+    Rule(
+        "points.contradict",
+        lambda found: _points_wrong(found) and _points_contradict(found),
+        _why_contradicted,
+    ),
+    Rule(
+        "points.too-few",
+        lambda found: 0 < found.points < LEAST_POINTS and _by_points_alone(found),
+        lambda found: (
+            f"Too few known depths to fix scale and shift: {found.points}; give at least {LEAST_POINTS}."
+        ),
+    ),
+    Rule("scale.uncertain", _scale_uncertain, _why_scale),
+    Rule(
+        "depth.off-matches",
+        lambda found: found.off_matches > OFF_MATCHES and found.points < LEAST_POINTS,
+        lambda found: (
+            f"The depth differs by {100 * math.expm1(found.off_matches):.0f} %, in the median, from what "
+            "both views match: the scale or the shift was not found."
+        ),
+    ),
+    Rule(
+        "depth.order-points",
+        lambda found: found.order < LEAST_ORDER and _by_points_alone(found),
+        lambda found: (
+            f"The prior and the known depths disagree on near and far (rank correlation {found.order:+.2f}): "
+            "are they metres along z in the left camera's frame, and is the space of the prior right?"
+        ),
+    ),
+    Rule("depth.exchanged", lambda found: _exchanged(found) and not found.inverse_fits, _why_exchanged),
+    Rule(
+        "depth.order",
+        _hardly_ordered,
+        lambda found: (
+            f"The prior and the matches hardly agree on near and far (rank correlation {found.order:+.2f}): "
+            "is E, K or the order of the images wrong, or is the right image of something else?"
+        ),
+    ),
+    Rule("pose.off-lines", lambda found: found.epipolar_px > EPIPOLAR_WRONG, _why_off_lines),
+    Rule("views.disagree", _views_disagree, _why_disagreement),
+)
+REMARKS = (
+    Rule(
+        "camera.field-of-view",
+        lambda found: found.view_deg < VIEWS_DEG[0] or found.view_deg > VIEWS_DEG[1],
+        lambda found: (
+            f"K gives the left image a field of view of {found.view_deg:.0f} degrees: is it for an image of "
             "another size?"
-        )
-    if _log(run.prior_ratio) > OWN_METRES:
-        remarks.append(
-            f"The depth is {run.prior_ratio:.2g} times the prior's own metres: is the baseline in metres, "
+        ),
+    ),
+    Rule(
+        "prior.metres",
+        lambda found: _log(found.prior_ratio) > OWN_METRES,
+        lambda found: (
+            f"The depth is {found.prior_ratio:.2g} times the prior's own metres: is the baseline in metres, "
             "and K for an image of this size? Or is the scene of a kind that the prior does not know?"
-        )
-    if not _points_wrong(run) and (sentence := _why_points(run)):
-        remarks.append(sentence)
-    if 0 < run.points < LEAST_POINTS and not math.isnan(run.matched):
-        remarks.append(f"Known depths that lie in the image: {run.points}, too few to rely on.")
-    if EPIPOLAR_PX < run.epipolar_px <= EPIPOLAR_WRONG:
-        remarks.append(_lines(run))
-    if run.on_edge and (not trusted or run.at_end > MOST_AT_END):
-        remarks.append(
-            "The search for the scale ended on the edge of its range: the depth may lie beyond it. Check the "
-            "units of the baseline, or widen depth_range (--near, --far)."
-        )
+        ),
+    ),
+    Rule(
+        "points.differ",
+        lambda found: not _points_wrong(found) and _points_differ_by_a_factor(found),
+        _why_factor,
+    ),
+    Rule(
+        "points.some-contradict",
+        lambda found: not _points_wrong(found) and _points_contradict(found),
+        _why_contradicted,
+    ),
+    Rule(
+        "points.few",
+        lambda found: 0 < found.points < LEAST_POINTS and not _by_points_alone(found),
+        lambda found: f"Known depths that lie in the image: {found.points}, too few to rely on.",
+    ),
+    Rule("pose.residual", lambda found: EPIPOLAR_PX < found.epipolar_px <= EPIPOLAR_WRONG, _why_off_lines),
+)
+#: A remark only where the result is not trusted for other reasons, or matches lie at an end of the range.
+ON_EDGE = Message(
+    "depth.search-edge",
+    "The search for the scale ended on the edge of its range: the depth may lie beyond it. Check the "
+    "units of the baseline, or widen depth_range (--near, --far).",
+)
+
+
+def _told(rules: Sequence[Rule], found: Indicators) -> tuple[Message, ...]:
+    return tuple(Message(rule.code, rule.sentence(found)) for rule in rules if rule.applies(found))
+
+
+def _reasons(found: Indicators) -> tuple[Message, ...]:
+    if found.same:
+        return (SAME_PICTURE,)
+    return (*found.doubts, *_told(EXPLAINING, found), *found.mistakes, *_told(REASONS, found))
+
+
+def _remarks(found: Indicators, trusted: bool) -> tuple[Message, ...]:
+    remarks = _told(REMARKS, found)
+    if found.on_edge and (not trusted or found.at_end > MOST_AT_END):
+        return (*remarks, ON_EDGE)
     return remarks
 
 
-def judge(run: Indicators) -> Verdict:
+def judge(found: Indicators) -> Verdict:
     """The verdict on one image's run: not trusted where any indicator is bad, or two are weak."""
-    reasons = _reasons(run)
-    enough = run.points >= ENOUGH_POINTS and run.cover >= LEAST_COVER
-    judged = enough or not math.isnan(run.matched)
+    reasons = _reasons(found)
+    enough = found.points >= ENOUGH_POINTS and found.cover >= LEAST_COVER
+    judged = enough or not _by_points_alone(found)
     status = "not trusted" if reasons else "trusted" if judged else "not judged"
-    return Verdict(status, tuple(reasons), tuple(_remarks(run, not reasons)), run)
+    return Verdict(status, reasons, _remarks(found, trusted=not reasons), found)

@@ -17,6 +17,7 @@ from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_numb
 from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.inputs import left_images
+from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.priors import DepthPrior, prior_of
 from geodiff_plugin.priors.pipeline import RESAMPLING, DepthDiffusionPipeline
 from geodiff_plugin.result.output import assemble_output, ensemble_metric, image_labels
@@ -90,13 +91,13 @@ class GuidedCall(_Stock):
                 call = _bind(super().__call__, image, *args, **kwargs)
                 run, stock = self._call_guided(call, guidance, callback_on_step_end, held)
                 with torch.autocast(self._execution_device.type, enabled=False):
-                    output = assemble_output(stock, run, guidance, call, guidance.warned | warned)
+                    output = assemble_output(stock, run, guidance, call, distinct(guidance.warned, warned))
         labelled = zip(image_labels(len(output.verdicts)), output.verdicts, strict=True)
-        untrusted = [label + verdict.sentence for label, verdict in labelled if not verdict.trusted]
+        untrusted = " ".join(label + verdict.sentence for label, verdict in labelled if not verdict.trusted)
         if strict and untrusted:
-            refuse(" ".join(untrusted))
+            refuse(untrusted)
         if output.verdict.status == "not trusted":
-            warn(" ".join(untrusted), stacklevel=3)
+            warn(Message("verdict.not-trusted", untrusted), stacklevel=3)
         output.latent = stock.latent if call["output_latent"] else None
         return output if call["return_dict"] else (output.prediction, output.uncertainty, output.latent)
 
@@ -279,7 +280,8 @@ def _one_member(call: dict[str, Any]) -> dict[str, Any]:
     for name, kind in (("generator", list), ("latents", Tensor)):
         if isinstance(call[name], kind):
             changed[name] = call[name][first]
-    warn("This prior gives the same map every time: only one member runs.", stacklevel=5)
+    sentence = "This prior gives the same map every time: only one member runs."
+    warn(Message("prior.one-member", sentence), stacklevel=5)
     return changed
 
 

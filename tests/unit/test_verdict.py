@@ -10,6 +10,7 @@ import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError
+from geodiff_plugin.messages import Message
 from geodiff_plugin.result.confidence import depth_confidence
 from geodiff_plugin.result.verdict import Indicators, judge
 from tests.scenes import render_pair
@@ -43,7 +44,10 @@ def test_a_good_run_is_trusted_in_silence():
         ({"same": True, "matched": 1.0, "confidence": 1.0}, "same picture"),
         ({"flat": True, "spread": 0.01, "order": 0.05}, "shifted copy"),
         (
-            {"inverse_fits": True, "mistakes": ("K may be for an image 2 times as large.",)},
+            {
+                "inverse_fits": True,
+                "mistakes": (Message("camera.scaled", "K may be for an image 2 times as large."),),
+            },
             "swapped.*2 times",
         ),
         ({"order": -0.57}, "swapped"),
@@ -63,7 +67,10 @@ def test_a_good_run_is_trusted_in_silence():
         ),
         ({"at_end": 0.26}, "26 % of the matches lie at an end"),
         ({"baseline_m": 0.00012}, "0.12 mm"),
-        ({"order": -0.9, "doubts": ("K is for another image.",)}, "depth: K is for another image"),
+        (
+            {"order": -0.9, "doubts": (Message("camera.principal-point", "K is for another image."),)},
+            "depth: K is for another image",
+        ),
         ({"off_matches": 0.4}, "differs by 49 %"),
         ({"scale_spread": 0.16}, "uncertain by 16 %"),
         ({"scale_spread": 0.16, "points": 2, "given_px": 15.2}, "depth: E misses the matches by 15 px"),
