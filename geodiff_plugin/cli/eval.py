@@ -26,7 +26,8 @@ class _ListOptions:
     data: Path | None = declare(None, "Folder to look into.")
 
 
-def _run(measure: Callable[[Any], Any], options: Any) -> None:
+def run_and_show(measure: Callable[[Any], Any], options: Any) -> None:
+    """Measure, and print the page or the path of the figure unless the options say quiet."""
     check_out(options.out)
     result = measure(options)
     if isinstance(result, Path) and not options.quiet:
@@ -69,6 +70,6 @@ def _list(options: _ListOptions) -> None:
     print_lines(rows)
 
 
-_COMMANDS = {name: each._replace(run=partial(_run, each.run)) for name, each in COMMANDS.items()}
-_COMMANDS["list"] = Command(_ListOptions, _list, "Say which data sets are there; list the methods.")
-eval_app = new_group("Measure this package on data sets, beside other methods.", _COMMANDS)
+LIST = Command(_ListOptions, _list, "Say which data sets are there; list the methods.")
+_COMMANDS = {name: each._replace(run=partial(run_and_show, each.run)) for name, each in COMMANDS.items()}
+eval_app = new_group("Measure this package on data sets, beside other methods.", _COMMANDS | {"list": LIST})

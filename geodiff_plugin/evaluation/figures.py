@@ -9,7 +9,7 @@ from functools import partial
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -115,8 +115,12 @@ def draw_inner_steps(options: FigureOptions) -> Drawing:
     return figure, numbers | {p: {"abs_rel": errors[p], "seconds": seconds[p]} for p in PRESETS}
 
 
-#: Candidates, as many as the one-number search of the paper preset has; weight of SSIM; pictures shown.
-CANDIDATES, ETA, SHOWN = 80, 0.85, 4
+#: Candidates for g_s, as many as the one-number search of the paper preset has.
+CANDIDATES = 80
+#: Weight of SSIM in the loss, the paper preset's.
+ETA = 0.85
+#: Pictures below the curves, beside the left image.
+SHOWN = 4
 
 
 def sweep_g_s(
@@ -212,34 +216,39 @@ def render_cloud(
     return np.where(seen_m[..., None] > 0, picture, np.uint8(255))
 
 
-def _answer(
-    sample: StereoSample, name: str, settings: Settings, priors: PriorCache
-) -> tuple[str, np.ndarray, float | None]:
-    """Title, depth ``(H, W)`` and AbsRel of a method; an empty map without AbsRel where it cannot work."""
+class _Answer(NamedTuple):
+    """What a method makes of a sample; an empty map without AbsRel where it cannot work."""
+
+    title: str
+    depth_m: np.ndarray
+    abs_rel: float | None
+
+
+def _answer(sample: StereoSample, name: str, settings: Settings, priors: PriorCache) -> _Answer:
     method = find_method(name)
     try:
         prediction = method.run(sample, method.adapted(settings), priors)
     except NotApplicable as reason:
-        return f"{method.title}: {reason}", np.full(sample.depth_m.shape, np.nan), None
+        return _Answer(f"{method.title}: {reason}", np.full(sample.depth_m.shape, np.nan), None)
     depth_m = in_metres(prediction, sample.depth_m, sample.valid)
     abs_rel = evaluate_depth(depth_m, sample.depth_m, sample.valid)["abs_rel"]
     if math.isnan(abs_rel):
-        return method.title, depth_m, None
-    return f"{method.title}, AbsRel {abs_rel:.3f}", depth_m, abs_rel
+        return _Answer(method.title, depth_m, None)
+    return _Answer(f"{method.title}, AbsRel {abs_rel:.3f}", depth_m, abs_rel)
 
 
 def _rows(
-    sample: StereoSample, answers: Sequence[tuple[str, np.ndarray, Any]], clouds: bool
+    sample: StereoSample, answers: Sequence[_Answer], clouds: bool
 ) -> tuple[list[np.ndarray], list[str]]:
     """Pictures of a sample, with titles: depth beside the left image, errors beside the truth, clouds."""
     truth = np.where(sample.valid, sample.depth_m, np.nan)
     near, far = depth_range(truth)
-    depths = [depth_m for _, depth_m, _ in answers]
+    depths = [answer.depth_m for answer in answers]
     pictures = [sample.left]
     pictures += [colour_depth(depth_m, near=near, far=far) for depth_m in (*depths, truth)]
     errors = [np.where(depth_m > 0, np.abs(depth_m - truth) / truth, np.nan) for depth_m in depths]
     pictures += [colour_share(error, WORST_SHOWN) for error in errors]
-    titles = [sample.name, *(title for title, _, _ in answers), f"truth, {near:.3g} m to {far:.3g} m"]
+    titles = [sample.name, *(answer.title for answer in answers), f"truth, {near:.3g} m to {far:.3g} m"]
     titles += [f"error, 0 to {WORST_SHOWN:.0%} of the depth"] * len(answers)
     if clouds:
         view = orbit(float(np.median(sample.depth_m[sample.valid])))
@@ -256,7 +265,7 @@ def draw_side_by_side(shown: Sequence[str], options: FigureOptions) -> Drawing:
         answers = [_answer(sample, name, options.settings, priors) for name in methods]
         pictures, headings = _rows(sample, answers, options.clouds)
         cells, titles = cells + pictures, titles + headings
-        numbers[sample.label] = {n: abs_rel for n, (_, _, abs_rel) in zip(methods, answers, strict=True)}
+        numbers[sample.label] = {n: a.abs_rel for n, a in zip(methods, answers, strict=True)}
     return grid(cells, titles, columns=1 + len(methods)), {"abs_rel": numbers}
 
 

@@ -167,14 +167,19 @@ def align(values: Map, truth_m: Map, valid: Map, space: str = "depth") -> Map:
     return np.maximum(kind.forward(x, metre).numpy(), FLOOR_M)
 
 
-#: A step of the true disparity between neighbours that makes an edge, and how near it "edge" reaches, pixels.
-STEP_PX, REACH_PX = 3.0, 4
+#: A step of the true disparity between neighbours that makes an edge, pixels.
+STEP_PX = 3.0
+#: How near an edge a pixel counts as "edge", pixels.
+REACH_PX = 4
 #: Ratios of neighbouring depths that Depth Pro counts as boundaries; a threshold weighs as much as its size.
 RATIOS = np.linspace(1.05, 1.25, 10)
-#: iBims-1's Canny filter of depth scaled to [0, 1], and its longest distance between two boundaries, pixels.
-CANNY_SIGMA, CANNY_LOW, CANNY_HIGH, FARTHEST_PX = np.sqrt(2.0), 0.1, 0.2, 10.0
-#: Step of log depth that makes an edge of dense truth; how near it counts, how far off surfaces begin, px.
-LOG_STEP, NEAR_EDGE, OFF_EDGE = 0.08, 3, 5
+#: iBims-1's Canny filter of depth scaled to [0, 1]: standard deviation of its blur, pixels,
+CANNY_SIGMA = np.sqrt(2.0)
+#: and its two thresholds of the gradient.
+CANNY_LOW = 0.1
+CANNY_HIGH = 0.2
+#: iBims-1's longest distance between two boundaries, pixels.
+FARTHEST_PX = 10.0
 
 
 def near_disparity_steps(disparity_px: Map, valid: Map) -> Map:
@@ -270,28 +275,3 @@ def filled(depth_m: Map, known: Map) -> Map:
     """The map with the nearest known depth in its holes, float64."""
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     return np.asarray(depth_m, np.float64)[tuple(nearest)]
-
-
-def depth_edges(depth_m: Map, valid: Map) -> Map:
-    """``(H, W)`` bool: pixels whose 3x3 neighbourhood is known and has a step of depth in it."""
-    log = np.log(np.where(valid, depth_m, 1.0))
-    high = ndimage.maximum_filter(np.where(valid, log, np.inf), 3)
-    low = ndimage.minimum_filter(np.where(valid, log, -np.inf), 3)
-    return np.isfinite(high) & np.isfinite(low) & (high - low > LOG_STEP)
-
-
-def edge_error(pred_m: Map, truth_m: Map, valid: Map) -> float:
-    """Mean relative error within ``NEAR_EDGE`` of the edges of dense truth; NaN without an edge."""
-    near = ndimage.binary_dilation(depth_edges(truth_m, valid), iterations=NEAR_EDGE) & valid
-    return float((np.abs(pred_m - truth_m)[near] / truth_m[near]).mean()) if near.any() else float("nan")
-
-
-def surface_error(pred_m: Map, truth_m: Map, valid: Map) -> float:
-    """Mean absolute error of the slope of log depth, per mille a pixel, more than 5 px from any edge."""
-    off = valid & ~ndimage.binary_dilation(depth_edges(truth_m, valid), iterations=OFF_EDGE)
-    difference = np.log(np.maximum(pred_m, 1e-6)) - np.log(np.where(valid, truth_m, 1.0))
-    whole = off[1:, 1:] & off[:-1, 1:] & off[1:, :-1]
-    if not whole.any():
-        return float("nan")
-    slopes = [np.abs(np.diff(difference, axis=axis)) for axis in (0, 1)]
-    return float(500.0 * (slopes[0][:, 1:] + slopes[1][1:])[whole].mean())

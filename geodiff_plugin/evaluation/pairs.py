@@ -8,6 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 from operator import itemgetter
+from typing import NamedTuple
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.algorithm.gradients import RULES
@@ -189,20 +190,29 @@ COST_METHODS = (PLAIN, "search-only", "guided", "guided:gradient=full", "paper")
 STEPS = 4
 
 
+class _Cost(NamedTuple):
+    """What a method took: pairs, median seconds, greatest peak of memory in bytes."""
+
+    pairs: int
+    seconds: float
+    peak: int
+
+
 def cost_table(records: Sequence[Record]) -> Table:
     """Seconds and memory of every method, and both as multiples of the plain pipeline's."""
-    costs, rows = {}, []
+    costs, rows = dict[str, _Cost](), []
     for method, group in tables.grouped((r for r in records if r["status"] == "ok"), "method").items():
         peak = max(record["peak_bytes"] for record in group)
-        costs[method] = len(group), statistics.median(record["seconds"] for record in group), peak
+        costs[method] = _Cost(len(group), statistics.median(record["seconds"] for record in group), peak)
     if PLAIN not in costs:
         cure = "See geodiff eval cost without --skip-broken for the reason."
         bad_value("the pairs", f"some on which {PLAIN} works", "none", cure)
-    _, plain_seconds, plain_peak = costs[PLAIN]
-    for method, (count, seconds, peak) in costs.items():
+    plain = costs[PLAIN]
+    for method, cost in costs.items():
         title = "plain pipeline" if method == PLAIN else find_method(method).title
-        times = f"{seconds:.2f}", f"{seconds / max(plain_seconds, 1e-3):.2f}"
-        rows.append((title, str(count), *times, f"{peak / 1e6:.0f}", f"{peak / max(plain_peak, 1):.2f}"))
+        times = f"{cost.seconds:.2f}", f"{cost.seconds / max(plain.seconds, 1e-3):.2f}"
+        memory = f"{cost.peak / 1e6:.0f}", f"{cost.peak / max(plain.peak, 1):.2f}"
+        rows.append((title, str(cost.pairs), *times, *memory))
     note = (
         "Median seconds and greatest peak over the pairs, each method in a process of its own, all of one "
         "prior with the same number of denoising steps. On CUDA the peak is what was allocated, weights "

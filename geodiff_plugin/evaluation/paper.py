@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -55,8 +55,13 @@ def _filler(method: str, methods: Sequence[str]) -> str:
     return next(ran, "")
 
 
-#: A row of a table: title, whether aligned, method, and the published cells by the title of a column.
-_Row = tuple[str, bool, str, Mapping[str, Sequence[str]]]
+class Row(NamedTuple):
+    """A row of a table; ``published`` are the paper's cells by the title of a column."""
+
+    title: str
+    aligned: bool
+    method: str
+    published: Mapping[str, Sequence[str]]
 
 
 class Layout(NamedTuple):
@@ -66,7 +71,7 @@ class Layout(NamedTuple):
     columns: tuple[Column, ...]
     methods: tuple[str, ...]
     metrics: tuple[str, ...]
-    rows: tuple[_Row, ...]
+    rows: tuple[Row, ...]
 
 
 #: Metric and its heading; Table 4 has the first two.
@@ -80,7 +85,7 @@ def _layout(text: str, columns: tuple[Column, ...], methods: tuple[str, ...]) ->
     for line in lines:
         name, kind, method, *cells = (part.strip() for part in line.split("|"))
         published = {c.title: of.split() for c, of in zip(columns, cells, strict=True)}
-        rows.append((name, kind == "aligned", method, published))
+        rows.append(Row(name, kind == "aligned", method, published))
     return Layout(title, columns, methods, tuple(METRICS)[: len(cells[0].split())], tuple(rows))
 
 
@@ -134,6 +139,17 @@ ABLATED = ("guided", "paper")
 """Keys of ``CHANGES`` whose tables stand below Table 4."""
 
 
+def _filled(layout: Layout, methods: Sequence[str], in_metres: Collection[str]) -> list[Row]:
+    """The layout's rows with the methods that fill them, then those of other methods, metres first."""
+    rows = [row._replace(method=_filler(row.method, methods)) for row in layout.rows]
+    taken = {row.method for row in rows}
+    for name in (name for name in methods if name not in taken):
+        title = find_method(name).title
+        rows += [Row(f"{title}†", False, name, {})] if name in in_metres else []
+        rows.append(Row(title, True, name, {}))
+    return rows
+
+
 def layout_table(
     layout: Layout, columns: Sequence[Column], records: Sequence[Record], methods: Sequence[str]
 ) -> Table:
@@ -145,18 +161,9 @@ def layout_table(
     for column in columns:
         groups.append((column.heading, count))
         groups += [(f"{column.title}, as published", count)] if column.complete else []
-    filled, empty = list[_Row](), list[str]()
-    for title, aligned, method, published in layout.rows:
-        filled.append((title, aligned, _filler(method, methods), published))
-        if _is_outside(method) and not filled[-1][2]:
-            empty.append(f"{title} (--methods {method})")
-    taken = {method for _, _, method, _ in filled}
-    for name in (name for name in methods if name not in taken):
-        title = find_method(name).title
-        filled += [(f"{title}†", False, name, {})] if values[False][0].get(name) else []
-        filled.append((title, True, name, {}))
+    in_metres = [name for name in methods if values[False][0].get(name)]
     rows = []
-    for title, aligned, method, published in filled:
+    for title, aligned, method, published in _filled(layout, methods, in_metres):
         cells = [title, "✓" if aligned else "✗"]
         for column in columns:
             of_method = (metric.get(method, {}) for metric in values[aligned])
@@ -164,6 +171,11 @@ def layout_table(
             cells += published.get(column.title, ["-"] * count) if column.complete else []
         rows.append(tuple(cells))
     note = "Capped at 80 m for KITTI and 10 m for Booster. † in metres as they come out."
+    empty = [
+        f"{row.title} (--methods {row.method})"
+        for row in layout.rows
+        if _is_outside(row.method) and not _filler(row.method, methods)
+    ]
     note += f" Not run here: {', '.join(dict.fromkeys(empty))}." if empty else ""
     header = ("Method", "GT-aligned", *[METRICS[metric] for metric in layout.metrics] * (len(groups) - 1))
     return Table(layout.title, header, tuple(rows), note, tuple(groups))
@@ -172,7 +184,7 @@ def layout_table(
 def methods_of(name: str, added: Sequence[str]) -> tuple[str, ...]:
     """Every method that a table runs: the paper's rows, others beside them, and what the user adds."""
     layout, changed = LAYOUTS[name], ABLATED if name == "ablation" else ()
-    printed = (method for _, _, method, _ in layout.rows if not _is_outside(method))
+    printed = (row.method for row in layout.rows if not _is_outside(row.method))
     names = [*printed, *layout.methods, *added]
     return tuple(dict.fromkeys([*names, *(method for preset in changed for _, method in CHANGES[preset])]))
 

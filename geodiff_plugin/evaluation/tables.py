@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from operator import itemgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -274,9 +274,18 @@ _BY_REGION = {
     if name != "bad3"
 }
 REGIONS = "AbsRel by region and material"
-#: Title -> where in a record its numbers are, their headings, note.
-DETAILS: dict[str, tuple[str, dict[str, str], str]] = {
-    REGIONS: (
+
+
+class Details(NamedTuple):
+    """A table of details: how the paths of its numbers in a record begin, a heading each, its note."""
+
+    where: str
+    headings: dict[str, str]
+    note: str
+
+
+DETAILS: dict[str, Details] = {
+    REGIONS: Details(
         "regions.",
         {
             **{"visible": "visible", "occluded": "occluded", "out_of_view": "out of view"},
@@ -287,24 +296,24 @@ DETAILS: dict[str, tuple[str, dict[str, str], str]] = {
         "match of confidence 0.5 or more, the same pixels for every method; ToM is transparent or mirror "
         "(classes 2, 3).",
     ),
-    "Disparity, rectified pairs": (
+    "Disparity, rectified pairs": Details(
         "disparity.",
         _DISPARITY,
         "Metres turned into disparity at the left image's resolution; shares of pixels for bad-k and D1, "
         "a dash where the truth's step is coarser than the threshold.",
     ),
-    "Disparity by region, rectified pairs": (
+    "Disparity by region, rectified pairs": Details(
         "disparity.regions.",
         _BY_REGION,
         "Visible: neither hidden in the right view nor beside it; edge: within 4 px of a step of the true "
         "disparity of more than 3 px; flat: the rest.",
     ),
-    "Boundaries, dense truth": (
+    "Boundaries, dense truth": Details(
         "boundaries.",
         {"f1": "boundary F1", "dbe_acc": "ε acc px", "dbe_comp": "ε comp px"},
         "F1 as Depth Pro defines it, higher is better; distances of depth boundaries as iBims-1 does.",
     ),
-    "AUSE": (
+    "AUSE": Details(
         "ause",
         {"": "uncertainty", "_confidence.ause": "confidence", "_confidence.random": "random order"},
         "Area under the sparsification error of AbsRel; 0 where the least certain pixels are the worst. An "

@@ -26,11 +26,11 @@ from geodiff_plugin.evaluation.baselines.unguided import sweep
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.experiment import DENSE
-from geodiff_plugin.evaluation.options import STRENGTHS
-from geodiff_plugin.evaluation.strength import EmulatedPrior
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.matching import consistency
 from geodiff_plugin.runtime import confidence
+from tests.lab.options import STRENGTHS
+from tests.lab.strength import EmulatedPrior
 
 __all__ = [
     "Decile",
@@ -157,7 +157,7 @@ def observe_emulated(sample: StereoSample, strengths: Sequence[str]) -> list[Obs
 
     Args:
         sample: with truth.
-        strengths: keys of ``emulated.STRENGTHS``.
+        strengths: keys of ``STRENGTHS``.
     """
     if sample.valid.mean() < DENSE:
         return []
@@ -271,7 +271,9 @@ def main(
     ensemble: Annotated[int, typer.Option(help="Members; 2 and more also fit the effect of spread.")] = 1,
     resolution: Annotated[int | None, typer.Option(help="Longer side for the prior, pixels.")] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:N or mps.")] = "cpu",
-    strengths: Annotated[str, typer.Option(help="Emulated priors besides: 5%,20%; see eval strength.")] = "",
+    strengths: Annotated[
+        str, typer.Option(help="Emulated priors (tests.lab strength) besides: 5%,20%.")
+    ] = "",
     what: Annotated[str, typer.Option(help="depth, matches or both.")] = "both",
 ) -> None:
     """Print coefficients of confidence, fitted on pairs with truth, and how they do on the other half."""

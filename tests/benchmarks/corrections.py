@@ -21,9 +21,9 @@ from geodiff_plugin.evaluation.baselines import PriorCache, Settings, find_metho
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.metrics import evaluate_depth
-from geodiff_plugin.evaluation.options import STRENGTHS
-from geodiff_plugin.evaluation.strength import EmulatedPrior
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from tests.lab.options import STRENGTHS
+from tests.lab.strength import EmulatedPrior
 
 __all__ = ["main"]
 

@@ -19,9 +19,9 @@ from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prio
 from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
-from geodiff_plugin.evaluation.metrics import evaluate_depth
-from geodiff_plugin.evaluation.options import STRENGTHS
-from geodiff_plugin.evaluation.strength import filled, relative_map
+from geodiff_plugin.evaluation.metrics import evaluate_depth, filled
+from tests.lab.options import STRENGTHS
+from tests.lab.strength import relative_map
 
 __all__ = ["main", "measure"]
 

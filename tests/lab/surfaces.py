@@ -27,8 +27,9 @@ from torch import Tensor
 
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior, read_calibration
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from geodiff_plugin.evaluation.metrics import evaluate_depth, surface_error
+from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.result import output
+from tests.lab.edges import surface_error
 
 __all__ = ["STAGES", "Flatness", "Stages", "draw_stages", "flatness", "guided_stages", "main"]
 
@@ -264,7 +265,3 @@ def _describe(console: Console, name: str, left: np.ndarray, stages: Stages, out
     console.print(f"{name}: {said}; pose {stages.pose}", highlight=False, soft_wrap=True)
     if out is not None:
         draw_stages(left, stages, out / f"{name}.png")
-
-
-if __name__ == "__main__":
-    typer.run(main)

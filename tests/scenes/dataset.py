@@ -18,7 +18,6 @@ import torch
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation.datasets import DATASETS
 from geodiff_plugin.evaluation.datasets.sample import Dataset, SampleRef, StereoSample, make_sample
-from geodiff_plugin.evaluation.frames import SEQUENCES
 from geodiff_plugin.types import Rig
 from tests.scenes import render_pair
 from tests.scenes.cameras import intrinsics
@@ -26,7 +25,6 @@ from tests.scenes.effects import indoor_cameras
 from tests.scenes.layouts import sample_scene
 from tests.scenes.render import render_linear
 from tests.scenes.scene import Camera, Material
-from tests.scenes.sequences import render_sequence
 
 __all__ = ["SYNTHETIC", "find_synthetic", "is_reflective", "load_synthetic"]
 
@@ -126,4 +124,3 @@ SYNTHETIC = Dataset(
 )
 
 DATASETS[SYNTHETIC.name] = SYNTHETIC
-SEQUENCES[SYNTHETIC.name] = render_sequence

@@ -20,7 +20,7 @@ from geodiff_plugin.capture.results import fuse, write_map, write_mesh
 from geodiff_plugin.cli.run import run_capture, summary
 from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED
 from geodiff_plugin.evaluation.baselines import PriorCache
-from geodiff_plugin.evaluation.frames import f_score
+from geodiff_plugin.evaluation.captures import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
 from geodiff_plugin.jobs import capture as run
 from geodiff_plugin.jobs.options import CaptureOptions

@@ -4,15 +4,14 @@ import json
 import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.stats import spearmanr
 
-from geodiff_plugin.evaluation import calibrations, experiment, pairs, paper, strength
+from geodiff_plugin.evaluation import experiment, pairs, paper
 from geodiff_plugin.evaluation.baselines import (
     FAMILIES,
     METHODS,
@@ -21,13 +20,12 @@ from geodiff_plugin.evaluation.baselines import (
     Prediction,
     find_method,
 )
-from geodiff_plugin.evaluation.calibrations import KINDS, POINTS, RIGHT, WRONG, run_poses
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import changed_ref
-from geodiff_plugin.evaluation.options import STRENGTHS, PosesOptions, StrengthOptions, TrustOptions
+from geodiff_plugin.evaluation.options import PosesOptions
 from geodiff_plugin.evaluation.pairs import CHANGES, FLATNESS, changes_table
 from geodiff_plugin.evaluation.paper import LAYOUTS, layout_table
-from geodiff_plugin.evaluation.strength import relative_map, run_strength
+from geodiff_plugin.evaluation.poses import run_poses
 from tests.evaluating import invoke, write_scenes
 
 
@@ -82,16 +80,9 @@ def test_pairs_goes_on_after_a_broken_sample_on_request_and_tries_it_again(data,
         ("pairs DATA --sample 3", "--sample must be at most 2"),
         ("pairs DATA --scenes three", "a sample with three in its name"),
         ("pairs TWICE --methods sgbm", "with several middlebury2014/one"),
-        ("poses", "--data must be given, or --rendered above 0"),
-        ("poses --rendered 1 --width 16", "--width must be between 64"),
-        *((f"poses --rendered 1 --perturb {text}", "--perturb") for text in ("1.5", "1..2,0.1", "99,0")),
-        ("poses --rendered 1 --drift 0.3,99", "--drift"),
-        ("trust --rendered 1 --kinds bent", "--kinds must be one of K-0.67"),
-        ("trust --rendered 1 --kinds unrelated", "without 'unrelated' where a pair is alone"),
-        ("strength --methods prior-fit@other", "--methods must be methods that use a prior"),
-        ("strength --methods sgbm", "--methods must be methods that use a prior"),
-        ("strength --strengths 7%", "--strengths"),
-        ("strength --data EMPTY", "--data must be a folder with pairs"),
+        ("poses", "--data must be given, or --exact"),
+        *((f"poses --data DATA --perturb {text}", "--perturb") for text in ("1.5", "1..2,0.1", "99,0")),
+        ("poses --data DATA --drift 0.3,99", "--drift"),
         ("table1 --data EMPTY", r"--data must be a folder with the data of table1; .* https?://"),
         ("table2", r"--data must be given; got nothing. Booster: .*https?://"),
     ],
@@ -134,6 +125,9 @@ def test_changed_samples_differ_in_what_was_changed_only():
     assert np.abs(turned.right.astype(int) - sample.right).mean() > 1
 
 
+POSED = Path("synthetic-posed:2@256x192")
+
+
 def test_the_page_of_poses(tmp_path, monkeypatch):
     """Two rendered pairs: estimated, one has no pose and the other is off by half without a word."""
 
@@ -148,93 +142,15 @@ def test_the_page_of_poses(tmp_path, monkeypatch):
 
     monkeypatch.setattr(experiment, "_measure", measure)
     page = tmp_path / "docs" / "results-pose.md"
-    options = PosesOptions(rendered=2, width=256, out=tmp_path / "out", results=page, quiet=True)
+    options = PosesOptions(exact=POSED, out=tmp_path / "out", results=page, quiet=True)
     run_poses("poses", options)
     assert {
-        "    geodiff eval poses --rendered 2 --width 256",
+        f"    geodiff eval poses --exact {POSED}",
         "| pair | true, given | perturbed, given | perturbed, refined | estimated |",
         "| mean of 2 pairs | 0.050 | 0.100 | 0.060 | 0.500 of 1 |",
         "| without a result | 0 | 0 | 0 | 1 |",
         "| off by more than 0.25, no warning | 0 | 0 | 0 | 1 |",
     } <= set(page.read_text().splitlines())
-
-
-SMALL = "synthetic:1+4@128x96"
-
-
-@pytest.fixture(scope="module")
-def sample():
-    return load(find_pairs(SMALL)[0])
-
-
-@pytest.mark.parametrize("space", ["disparity", "depth", "log"])
-def test_a_prior_errs_as_much_as_it_says(sample, space):
-    exact = relative_map(sample, STRENGTHS["exact"], space)
-    assert exact.min() == 0.0 and exact.max() == 1.0
-    off = [np.abs(relative_map(sample, STRENGTHS[s], space) - exact).mean() for s in ("2%", "5%", "20%")]
-    assert 0 < off[0] < off[1] < off[2]
-    inner = sample.valid & (exact > 0.05) & (exact < 0.95)
-    ranks = spearmanr(exact[inner], sample.depth_m[inner]).statistic  # without an error, one orders the other
-    assert ranks == pytest.approx(-1.0 if space == "disparity" else 1.0, abs=1e-6)
-
-
-def test_the_command_writes_a_page_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
-    methods = ("prior-aligned", "prior-fit", "guided")
-    given = {"strengths": ("exact", "20%"), "methods": methods, "steps": 2, "resolution": 96, "quiet": True}
-    options = StrengthOptions(data=(SMALL,), out=tmp_path, **given)
-    page = run_strength("strength", options)
-    rows = {(row[0], row[1]): float(row[2]) for row in page.tables[0].rows}
-    assert len(rows) == 6 and rows["exact", "prior + oracle"] < rows["20%", "prior + oracle"]
-    assert rows["20%", "guided"] < rows["20%", "prior + oracle"]
-    monkeypatch.setattr(strength, "_measure", lambda *_: pytest.fail("every record is there"))
-    assert run_strength("strength", options).tables == page.tables
-
-
-def test_every_kind_of_wrong_calibration_changes_what_it_says(sample):
-    other = replace(sample, right=sample.right[::-1], K_right=2 * sample.K_right)
-    cases = {kind: change(sample, other) for kind, (_, change, _) in KINDS.items()}
-    expected = {"swapped": {"left", "right"}, "unrelated": {"right", "K_right"}}
-    expected |= dict.fromkeys(("mirrored", "one-picture", "shifted"), {"right"})
-    expected |= {kind: set() for kind, (_, _, factor) in KINDS.items() if factor or kind in RIGHT}
-    names = ("left", "right", "K_left", "K_right", "E")
-    for kind, case in cases.items():
-        changed = {name for name in names if not np.array_equal(getattr(case, name), getattr(sample, name))}
-        assert changed == expected.get(kind, {"K_left", "K_right"} if kind.startswith("K-") else {"E"}), kind
-    assert cases["millimetres"].E[0, 3] == pytest.approx(1000 * sample.E[0, 3])
-    assert cases["K-2"].K_left[0].tolist() == [2 * sample.K_left[0, 0], 0, sample.K_left[0, 2]]
-    np.testing.assert_allclose(cases["inverse"].E @ sample.E, np.eye(4), atol=1e-12)
-    turn = Rotation.from_matrix(np.linalg.inv(sample.E[:3, :3]) @ cases["tilted"].E[:3, :3])
-    np.testing.assert_allclose(turn.as_rotvec(degrees=True), (2, 0, 0), atol=1e-9)
-    points = calibrations._points(sample)
-    column, row = np.rint(points[0] @ sample.K_left.T / points[0, 2]).astype(int)[:2]
-    assert len(points) == POINTS and points[0, 2] == pytest.approx(sample.depth_m[row, column], rel=1e-6)
-
-
-def test_trust_counts_and_goes_on(tmp_path, monkeypatch):
-    """All but the rectified pair's K are detected; one right pair is not trusted; no prior is loaded."""
-    asked = []
-    monkeypatch.setattr(calibrations.PriorCache, "get", lambda *_: None)
-    monkeypatch.setattr(calibrations.PriorCache, "fingerprint", lambda *_: "none")
-
-    def measure(ref, other, kind, read, pipe, settings):
-        asked.append(kind)
-        assert (ref is other) == (kind != "unrelated")
-        rectified = not ref.files["posed"]
-        missed, distrusted = kind == "K-2" and rectified, kind in RIGHT and not rectified
-        status = "not trusted" if distrusted or (kind not in RIGHT and not missed) else "trusted"
-        off = 0.01 if kind == "right" else 0.5
-        return {"rectified": rectified, "status": status, "said": [], "off": off}
-
-    monkeypatch.setattr(calibrations, "_measure", measure)
-    options = TrustOptions(rendered=2, width=64, kinds=("swapped", "K-2"), out=tmp_path, quiet=True)
-    for _ in range(2):
-        calibrations.run_trust("trust", options)
-        assert len(asked) == 6
-    page = (tmp_path / "trust.md").read_text()
-    assert "geodiff eval trust --rendered 2 --width 64 --kinds swapped,K-2\n" in page
-    assert "3 of 4 (75 %)" in page and "1 of 2 (50 %)" in page and "2 of 2 (100 %)" in page
-    calibrations.run_trust("trust", replace(options, kinds=()))
-    assert asked[6:] == [kind for kind in [*RIGHT[1:], *WRONG] if kind not in ("swapped", "K-2")] * 2
 
 
 def make_record(method, sample, raw, aligned, **rest):

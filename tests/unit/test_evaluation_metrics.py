@@ -168,14 +168,3 @@ def test_boundary_errors_are_distances_of_parallel_edges(moved):
     truth, pred = (np.where(np.arange(60)[None] < c, 2.0, 7.0).repeat(40, 0) for c in (30, 30 + moved))
     errors = metrics.boundary_errors(3.0 * pred, truth, np.ones(truth.shape, bool))
     assert errors == pytest.approx({"dbe_acc": moved, "dbe_comp": moved}, abs=0.2)
-
-
-def test_errors_at_edges_and_of_surfaces():
-    truth, shifted = (np.where(np.arange(60)[None] < c, 2.0, 4.0).repeat(40, 0) for c in (30, 32))
-    valid = np.ones(truth.shape, bool)
-    assert metrics.edge_error(truth, truth, valid) == metrics.surface_error(truth, truth, valid) == 0.0
-    assert metrics.edge_error(shifted, truth, valid) > 0.1
-    assert metrics.surface_error(shifted, truth, valid) == 0.0
-    rough = truth * np.exp(0.01 * np.random.default_rng(0).normal(size=truth.shape))
-    assert metrics.surface_error(rough, truth, valid) > 5.0
-    assert np.isnan(metrics.edge_error(truth, np.full(truth.shape, 2.0), valid))

@@ -1,38 +1,11 @@
-"""Rendered sequences, their flicker, and frames averaged with their neighbours."""
+"""Frames averaged with their neighbours, on rendered sequences."""
 
 import numpy as np
 import pytest
 
 from geodiff_plugin.capture.agreement import DepthFrame, scene_poses, steadied
-from geodiff_plugin.evaluation import frames
-from geodiff_plugin.evaluation.baselines import PriorCache
-from geodiff_plugin.evaluation.options import WAYS, SequenceOptions
+from tests.lab.sequence import flicker, true_frames
 from tests.scenes import render_sequence
-
-
-def test_flicker_is_what_changes_on_the_same_points():
-    truth = frames.true_frames(render_sequence(3, 3, size=(48, 64)))
-    still = [np.full((48, 64), 0.1)] * 3
-    assert frames.flicker(still, truth) == (0.0, 0.0)  # wrong, but steadily so
-    breathing = [np.full((48, 64), value) for value in (0.0, 0.02, 0.0)]
-    assert frames.flicker(breathing, truth) == pytest.approx((0.02, 0.02))
-    noise = np.random.default_rng(0).normal(size=(3, 48, 64)) * 0.1
-    points, breath = frames.flicker(list(noise), truth)
-    # The mean of |a - b| of two normal numbers of deviation s is 2 s / sqrt(pi).
-    assert points == pytest.approx(0.2 / np.sqrt(np.pi), rel=0.1) and breath < 0.02
-
-
-def test_the_command_measures_and_goes_on(tmp_path, monkeypatch):
-    given = {"size": (64, 96), "ways": ("alone", "steady"), "steps": 2, "out": tmp_path, "quiet": True}
-    options = SequenceOptions(scenes=1, frames=2, **given)
-    page = frames.run_sequence("sequence", options)
-    assert [row[0] for row in page.tables[0].rows] == ["each frame alone", WAYS["steady"]]
-    assert all(0 < float(row[1]) < 2 and float(row[-1]) > 0 for row in page.tables[0].rows)
-    monkeypatch.setattr(frames, "_measure_sequence", lambda *_: pytest.fail("it was measured"))
-    assert frames.run_sequence("sequence", options).tables == page.tables
-    monkeypatch.setattr(PriorCache, "fingerprint", lambda self, settings: "trained further")
-    with pytest.raises(pytest.fail.Exception):
-        frames.run_sequence("sequence", options)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +21,7 @@ def of_depth(sequence, depths):
 
 
 def test_the_motion_of_the_camera_is_found_and_a_cut_begins_a_scene(sequence):
-    truth = frames.true_frames(sequence)
+    truth = true_frames(sequence)
     known, pictures = of_depth(sequence, [np.nan_to_num(frame.depth, nan=50.0) for frame in truth])
     (poses,) = scene_poses(zip(known, pictures, strict=True))
     for frame, E in zip(truth, poses, strict=True):
@@ -60,13 +33,13 @@ def test_the_motion_of_the_camera_is_found_and_a_cut_begins_a_scene(sequence):
 
 
 def test_frames_that_agree_are_averaged_within_their_scene(sequence):
-    truth = frames.true_frames(sequence)
+    truth = true_frames(sequence)
     off = [0.02 * (-1) ** k for k in range(4)]
     known, _ = of_depth(sequence, [frame.depth * np.exp(o) for frame, o in zip(truth, off, strict=True)])
     of_camera = [np.linalg.inv(truth[0].E) @ frame.E for frame in truth]
     steady = list(steadied([of_camera], known.__getitem__))
     errors = [np.log(frame.depth / true.depth) for frame, true in zip(steady, truth, strict=True)]
-    assert frames.flicker(errors, truth)[0] < 0.4 * 0.04
+    assert flicker(errors, truth)[0] < 0.4 * 0.04
     assert max(np.nanmean(np.abs(error)) for error in errors) < 0.7 * 0.02
     known[1].depth[40:80, 60:100] *= 0.5  # something that moves: no other frame has it there
     known[1].confidence[40:80, 60:100] = 0.9

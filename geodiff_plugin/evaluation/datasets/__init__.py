@@ -20,7 +20,7 @@ from geodiff_plugin.evaluation.datasets.sample import (
     changed_ref,
     two_numbers,
 )
-from geodiff_plugin.evaluation.options import RealOptions, SampleOptions
+from geodiff_plugin.evaluation.options import SampleOptions
 
 __all__ = ["DATASETS", "Dataset", "SampleRef", "StereoSample", "find_pairs", "load"]
 
@@ -63,7 +63,7 @@ def all_refs(options: SampleOptions, datasets: Sequence[str] = ()) -> list[Sampl
     return find_pairs(data_of(options), datasets or options.datasets or None, **given)
 
 
-def _kept(refs: Sequence[SampleRef], data: Path, scenes: Sequence[str] = ()) -> list[SampleRef]:
+def some_pairs(refs: Sequence[SampleRef], data: Path, scenes: Sequence[str] = ()) -> list[SampleRef]:
     """The samples whose label contains one of ``scenes``; ``ValueError`` for none, or for two of one name."""
     kept = [ref for ref in refs if not scenes or any(scene in ref.label for scene in scenes)]
     if not kept:
@@ -79,22 +79,9 @@ def _kept(refs: Sequence[SampleRef], data: Path, scenes: Sequence[str] = ()) -> 
     return kept
 
 
-def real_and_rendered(options: RealOptions, kind: str) -> tuple[list[SampleRef], list[SampleRef]]:
-    """The first pairs of ``--data``, and ``--rendered`` ones: ``synthetic`` or ``synthetic-posed``."""
-    if options.data is None and not options.rendered:
-        bad_value("--data", "given, or --rendered above 0", "neither")
-    if options.rendered and "synthetic" not in DATASETS:
-        cure = "A clone of the repository has it: python -m tests.scenes eval ..."
-        bad_value("--rendered", "0 where no data set 'synthetic' is registered", options.rendered, cure)
-    real = [] if options.data is None else _kept(find_pairs(options.data), options.data)
-    of_size = f"{kind}:{options.rendered}@{options.width}x{options.width * 3 // 4}"
-    rendered = find_pairs(of_size, ["synthetic"]) if options.rendered else []
-    return real[: options.limit], rendered
-
-
 def select(options: SampleOptions, refs: Sequence[SampleRef] | None = None) -> list[SampleRef]:
     """The samples that ``scenes`` names, ``sample`` drawn of them, the first ``limit``, some perturbed."""
-    kept = _kept(all_refs(options) if refs is None else refs, data_of(options), options.scenes)
+    kept = some_pairs(all_refs(options) if refs is None else refs, data_of(options), options.scenes)
     count = getattr(options, "sample", None)
     if count is not None:
         if count > len(kept):

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from PIL import Image
 from geodiff_plugin._checks import bad_value, check_choice
 from geodiff_plugin.evaluation.datasets.sample import (
     Dataset,
+    ExtraView,
     Images,
     SampleRef,
     StereoSample,
@@ -73,33 +74,58 @@ def _like(image: np.ndarray, path: Path, values: np.ndarray) -> np.ndarray:
     return values
 
 
-#: Folders of left and right images with the numbers of their cameras, of calibrations, of both truths.
-_KITTI = {
-    "kitti2015": ([("image_2", "image_3", (2, 3))], "calib_cam_to_cam", "disp_occ_0", "disp_noc_0"),
-    "kitti2012": (
-        [("colored_0", "colored_1", (2, 3)), ("image_0", "image_1", (0, 1))],
-        *("calib", "disp_occ", "disp_noc"),
+class _KittiViews(NamedTuple):
+    """Folders of the left and right images of one kind, and the numbers of their cameras."""
+
+    left: str
+    right: str
+    cameras: tuple[int, int]
+
+
+class _KittiYear(NamedTuple):
+    """Folders below ``training``: views, the better first; calibrations; truth of all and of some pixels."""
+
+    views: tuple[_KittiViews, ...]
+    calibrations: str
+    occ: str
+    noc: str
+
+
+_COLOUR_CAMERAS = (2, 3)
+_GREY_CAMERAS = (0, 1)
+_KITTI_2015 = _KittiYear(
+    views=(_KittiViews("image_2", "image_3", _COLOUR_CAMERAS),),
+    calibrations="calib_cam_to_cam",
+    occ="disp_occ_0",
+    noc="disp_noc_0",
+)
+_KITTI_2012 = _KittiYear(
+    views=(
+        _KittiViews("colored_0", "colored_1", _COLOUR_CAMERAS),
+        _KittiViews("image_0", "image_1", _GREY_CAMERAS),
     ),
-}
+    calibrations="calib",
+    occ="disp_occ",
+    noc="disp_noc",
+)
 
 
-def _find_kitti(root: Path, name: str) -> list[SampleRef]:
+def _find_kitti(root: Path, name: str, year: _KittiYear) -> list[SampleRef]:
     """Pairs below ``training``, its parent or that one's: colour before grey, all pixels before fewer."""
-    refs, (pairs, calibrations, *truths) = [], _KITTI[name]
+    refs = []
     for folder in _folders(root, 3):
-        there = [pair for pair in pairs if (folder / pair[0]).is_dir()]
-        if not there or not any((folder / truth).is_dir() for truth in truths):
+        there = [views for views in year.views if (folder / views.left).is_dir()]
+        if not there or not any((folder / truth).is_dir() for truth in (year.occ, year.noc)):
             continue
-        left_name, right_name, cameras = there[0]
-        for left in sorted((folder / left_name).glob("*_10.png")):
-            occ, noc = (folder / truth / left.name for truth in truths)
+        for left in sorted((folder / there[0].left).glob("*_10.png")):
+            occ, noc = folder / year.occ / left.name, folder / year.noc / left.name
             files = {
                 "left": left,
-                "right": folder / right_name / left.name,
+                "right": folder / there[0].right / left.name,
                 "disparity": _existing(occ) or _existing(noc) or occ,
                 "noc": _existing(noc) if occ.is_file() else None,
-                "calibration": folder / calibrations / f"{left.stem[:-3]}.txt",
-                "cameras": cameras,
+                "calibration": folder / year.calibrations / f"{left.stem[:-3]}.txt",
+                "cameras": there[0].cameras,
             }
             refs.append(SampleRef(name, left.stem[:-3], files))
     return refs
@@ -284,7 +310,7 @@ def _load_posed(ref: SampleRef) -> StereoSample:
     for view in files["views"][2:]:
         image, camera = read_rgb(files[f"image {view}"], "further image"), files[f"camera {view}"]
         pose = read_calibration((files["calibration"], camera))
-        extra.append((image, pose.K_right - half, pose.E))
+        extra.append(ExtraView(image, pose.K_right - half, pose.E))
     depth_m, named = np.zeros(images[0].shape[:2], np.float32), f"no {truth}"
     if truth.is_file() or ref.dataset == "robustmvd":
         depth_m = _like(images[0], truth, read_map(truth, "true depth"))
@@ -335,53 +361,81 @@ def _load_folder(ref: SampleRef) -> StereoSample:
     return make_sample(ref, images, rig, depth_m, {"truth": truth})
 
 
+#: Options of finding posed pairs, beside the folder.
 _POSED = ("pairs", "pixel_centre")
-#: How each set is found, read and capped (metres), the options of finding it, and how to obtain it.
-_LAYOUTS: dict[str, tuple[Any, Any, float | None, tuple[str, ...], str]] = {
-    "kitti2015": (
-        *(_find_kitti, _load_kitti, 80.0, ()),
-        "data_scene_flow.zip and data_scene_flow_calib.zip from "
+#: Every set, in the order in which results are listed.
+LAYOUTS = [
+    Dataset(
+        name="kitti2015",
+        find=partial(_find_kitti, name="kitti2015", year=_KITTI_2015),
+        load=_load_kitti,
+        cap_m=80.0,
+        obtain="data_scene_flow.zip and data_scene_flow_calib.zip from "
         "https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php (CC BY-NC-SA 3.0), in one folder.",
     ),
-    "kitti2012": (
-        *(_find_kitti, _load_kitti, 80.0, ()),
-        "data_stereo_flow.zip from https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php "
+    Dataset(
+        name="kitti2012",
+        find=partial(_find_kitti, name="kitti2012", year=_KITTI_2012),
+        load=_load_kitti,
+        cap_m=80.0,
+        obtain="data_stereo_flow.zip from https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php "
         "(CC BY-NC-SA 3.0).",
     ),
-    "middlebury2014": (
-        *(_find_scenes, _load_scene, None, ()),
-        "scene folders from https://vision.middlebury.edu/stereo/data/scenes2014/ (free with citation).",
+    Dataset(
+        name="middlebury2014",
+        find=partial(_find_scenes, name="middlebury2014"),
+        load=_load_scene,
+        cap_m=None,
+        obtain="scene folders from https://vision.middlebury.edu/stereo/data/scenes2014/ "
+        "(free with citation).",
     ),
-    "middeval3": (
-        *(_find_scenes, _load_scene, None, ()),
-        "MiddEval3-data-Q.zip and MiddEval3-GT0-Q.zip (or H, F) from "
+    Dataset(
+        name="middeval3",
+        find=partial(_find_scenes, name="middeval3"),
+        load=_load_scene,
+        cap_m=None,
+        obtain="MiddEval3-data-Q.zip and MiddEval3-GT0-Q.zip (or H, F) from "
         "https://vision.middlebury.edu/stereo/submit3/, in one folder.",
     ),
-    "eth3d": (
-        *(_find_scenes, _load_scene, None, ()),
-        "two_view_training.7z and two_view_training_gt.7z from https://www.eth3d.net/datasets "
+    Dataset(
+        name="eth3d",
+        find=partial(_find_scenes, name="eth3d"),
+        load=_load_scene,
+        cap_m=None,
+        obtain="two_view_training.7z and two_view_training_gt.7z from https://www.eth3d.net/datasets "
         "(CC BY-NC-SA 4.0), in folders of these names.",
     ),
-    "booster": (
-        *(_find_booster, _load_booster, 10.0, ()),
-        "booster_gt.zip from https://cvlab-unibo.github.io/booster-web/ (non-commercial research).",
+    Dataset(
+        name="booster",
+        find=partial(_find_booster, name="booster"),
+        load=_load_booster,
+        cap_m=10.0,
+        obtain="booster_gt.zip from https://cvlab-unibo.github.io/booster-web/ (non-commercial research).",
     ),
-    "mvsnet": (
-        *(_find_posed, _load_posed, None, _POSED),
-        "folders of images/, cams/ and pair.txt as MVSNet code circulates Tanks and Temples; "
+    Dataset(
+        name="mvsnet",
+        find=partial(_find_posed, name="mvsnet"),
+        load=_load_posed,
+        cap_m=None,
+        obtain="folders of images/, cams/ and pair.txt as MVSNet code circulates Tanks and Temples; "
         "for the numbers here also depths/*.pfm in metres.",
+        options=_POSED,
     ),
-    "robustmvd": (
-        *(partial(_find_posed, pixel_centre=0.5), _load_posed, None, _POSED),
-        "tanks_and_temples_images.zip and tanks_and_temples_depth.zip of https://github.com/lmb-freiburg/"
-        "robustmvd; then cams/ and pair.txt from its sample list as docs/how-to/evaluation.md shows.",
+    Dataset(
+        name="robustmvd",
+        find=partial(_find_posed, name="robustmvd", pixel_centre=0.5),
+        load=_load_posed,
+        cap_m=None,
+        obtain="tanks_and_temples_images.zip and tanks_and_temples_depth.zip of "
+        "https://github.com/lmb-freiburg/robustmvd; then cams/ and pair.txt from its sample list as "
+        "docs/how-to/evaluation.md shows.",
+        options=_POSED,
     ),
-    "folder": (
-        *(_find_folders, _load_folder, None, ()),
-        "your own: <pair>/left.png, right.png, calib.* and depth.npy, .pfm (metres) or .png (mm).",
+    Dataset(
+        name="folder",
+        find=partial(_find_folders, name="folder"),
+        load=_load_folder,
+        cap_m=None,
+        obtain="your own: <pair>/left.png, right.png, calib.* and depth.npy, .pfm (metres) or .png (mm).",
     ),
-}
-LAYOUTS = [
-    Dataset(name, partial(find, name=name), load, cap_m, obtain, options)
-    for name, (find, load, cap_m, options, obtain) in _LAYOUTS.items()
 ]

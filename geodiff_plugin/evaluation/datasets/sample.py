@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -27,6 +27,14 @@ Images = tuple[Array, Array]
 Numbers = tuple[float, float]
 
 
+class ExtraView(NamedTuple):
+    """A further right view: image ``(H, W, 3)`` uint8, its K, its pose in the left camera's frame, metres."""
+
+    image: Array
+    K: Array
+    E: Array
+
+
 @dataclass(frozen=True, eq=False)
 class StereoSample:
     """Two posed views with the truth of the left one, the reference view."""
@@ -44,7 +52,7 @@ class StereoSample:
     material: Array | None = None  # (H, W) uint8 class, if the set has any
     rectified: bool = False  # as geometry.is_rectified
     notes: Mapping[str, Any] = field(default_factory=dict)  # for a reader: truth, disparity_step_px ...
-    extra_views: tuple[tuple[Array, Array, Array], ...] = ()  # further (image, K, E)
+    extra_views: tuple[ExtraView, ...] = ()
     E_true: Array | None = None  # where E is wrong on purpose, but for the length of the baseline
 
     @property
@@ -207,7 +215,7 @@ def with_perturbed_poses(sample: StereoSample, change: Sequence[float], name: st
         given[:3, 3] = moved * baseline / np.linalg.norm(moved)
         return given
 
-    E, extra = wrong(sample.E), tuple((image, K, wrong(other)) for image, K, other in sample.extra_views)
+    E, extra = wrong(sample.E), tuple(view._replace(E=wrong(view.E)) for view in sample.extra_views)
     return replace(sample, name=name, E=E, E_true=sample.E_scored, extra_views=extra)
 
 

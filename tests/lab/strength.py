@@ -1,4 +1,4 @@
-"""Guidance of priors from exact to weak: ``geodiff eval strength``, with emulated priors of chosen error.
+"""Guidance of priors from exact to weak, emulated, with a chosen error (docs/reference/strength.md).
 
 Only the network is emulated: it answers ``(1 - follow) z0* + follow z0(z_t)``, ``z0*`` the code of the
 erroneous truth, ``z0(z_t)`` what its input says, so that an edit of one step is seen by the next one.
@@ -26,13 +26,14 @@ from geodiff_plugin.evaluation import tables
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, data_of, find_pairs, load
 from geodiff_plugin.evaluation.experiment import DENSE, Page, cell_key, in_metres, run_experiment
-from geodiff_plugin.evaluation.metrics import edge_error, evaluate_depth, filled, surface_error, to_space
-from geodiff_plugin.evaluation.options import STRENGTHS, StrengthOptions
+from geodiff_plugin.evaluation.metrics import evaluate_depth, filled, to_space
 from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, method_title, most_of
 from geodiff_plugin.jobs.runner import Item, Record
 from geodiff_plugin.priors import prior_of
 from geodiff_plugin.runtime.noise_levels import noise_level
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from tests.lab.edges import edge_error, surface_error
+from tests.lab.options import STRENGTHS, Strength, StrengthOptions
 
 NOTE = (
     "The emulated prior's log depth is off by so much in the mean, half of it smooth and half constant over "
@@ -52,23 +53,24 @@ COLUMNS: dict[str, CellOf] = {
 }
 #: What a prior calls 0 and 1: the quantiles of Marigold's training; the rest of the map lies beyond them.
 ENDS = (0.02, 0.98)
-#: Standard deviation of the smooth half of the error, and spacing of the segments of the other half, as
-#: shares of the longer side; that of the blur.
-SMOOTH, SEGMENTS, BLUR = 0.12, 0.16, 0.012
-Strength = tuple[float, bool, float]  # a value of ``STRENGTHS``
+#: Standard deviation of the smooth half of the error, as a share of the longer side.
+SMOOTH = 0.12
+#: Spacing of the segments of the other half, as a share of the longer side.
+SEGMENTS = 0.16
+#: Standard deviation of the blur, as a share of the longer side.
+BLUR = 0.012
 
 
 def relative_map(sample: StereoSample, strength: Strength, space: str, seed: int = 0) -> np.ndarray:
     """``(H, W)`` float64 in [0, 1], the map of a prior that errs in a given way, alike in every space."""
     log_depth = np.log(filled(sample.depth_m, sample.valid))
     rng = np.random.default_rng([seed, 47])
-    error, blur, gamma = strength
-    log_depth = log_depth + error * _error(log_depth, rng)
+    log_depth = log_depth + strength.error * _error(log_depth, rng)
     values = to_space(np.exp(log_depth), space)
-    if blur:
+    if strength.blurred:
         values = ndimage.gaussian_filter(values, BLUR * max(values.shape), mode="nearest")
     low, high = np.quantile(values, ENDS)
-    return np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0) ** gamma
+    return np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0) ** strength.gamma
 
 
 def _error(log_depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -166,24 +168,48 @@ def _measure(
     return kind | {"abs_rel": scores["abs_rel"], "delta1": scores["delta1"]} | errors
 
 
+def against_table(title: str, records: Sequence[Record], reference: str = "guided") -> Table:
+    """Paired differences in AbsRel, the reference minus every other method, at each strength."""
+    header = ("prior's error", "against", "pairs", "mean difference [95 %]", "% of its error", "pairs won")
+    note = "Negative: smaller error than the other method. An interval without 0 tells the two apart."
+    rows = list[tuple[str, ...]]()
+    for strength, of_strength in tables.grouped(records, "strength").items():
+        # Every method has every pair, in one order; two pairs of two folders may have one name.
+        errors = {
+            method: {str(i): float(record["abs_rel"]) for i, record in enumerate(group)}
+            for method, group in tables.grouped(of_strength, "method").items()
+        }
+        own = errors.pop(reference, {})
+        for method, other in errors.items() if own else ():
+            difference = tables.paired_difference(own, other)
+            share = 100.0 * difference.value / float(np.mean(list(other.values())))
+            won = f"{sum(own[i] < other[i] for i in own)} of {len(own)}"
+            cells = (str(len(own)), difference.cell(4, "+"), f"{share:+.1f}", won)
+            rows.append((str(strength), find_method(method).title, *cells))
+    return Table(
+        f"{title}: {find_method(reference).title} against each other method", header, tuple(rows), note
+    )
+
+
 def strength_tables(records: Sequence[Record]) -> list[Table]:
-    """One table a group of pairs, strengths by methods."""
+    """Two tables a group of pairs: strengths by methods, and the default against the others."""
     groups = {
         "All pairs": list(records),
         "Rendered, rectified": [r for r in records if r["rendered"] and r["rectified"]],
         "Rendered, any pose": [r for r in records if r["rendered"] and not r["rectified"]],
         "Real": [r for r in records if not r["rendered"]],
     }
-    names, page = ("strength", "method"), []
+    names, page = ("strength", "method"), list[Table]()
     for title, group in groups.items():
         if group:
             # Not by label: pairs of one name in two folders are two.
             pairs = tables.count_of_pairs(max(map(len, tables.grouped(group, *names).values())))
             page.append(tables.table_of_groups(title, group, names, COLUMNS, f"{pairs}. {NOTE}"))
+            page.append(against_table(title, group))
     return page
 
 
-def run_strength(name: str, options: StrengthOptions) -> Page | None:
+def run(name: str, options: StrengthOptions) -> Page | None:
     """Measure every method at every strength, and write the page; errors as ``run_experiment``."""
     for method in map(find_method, options.methods):
         if not method.uses_prior or method.prior is not None:

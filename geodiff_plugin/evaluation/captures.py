@@ -1,10 +1,9 @@
-"""Frames of a moving rig (``geodiff eval sequence``) and of a moving camera (``geodiff eval capture``)."""
+"""Frames of a moving camera: ``geodiff eval capture``."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from functools import lru_cache, partial
+from functools import partial
 from itertools import pairwise, product
 from typing import Any
 
@@ -13,118 +12,21 @@ import torch
 from scipy.spatial import cKDTree
 
 from geodiff_plugin import __version__
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin.capture.agreement import DepthFrame, agreed, scene_poses, seen_in, steadied
+from geodiff_plugin.capture.agreement import DepthFrame, agreed, seen_in
 from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.experiment import Page, run_experiment
 from geodiff_plugin.evaluation.metrics import evaluate_depth
-from geodiff_plugin.evaluation.options import CAPTURE_ROWS, WAYS, CaptureEvalOptions, SequenceOptions
-from geodiff_plugin.evaluation.tables import CellOf, Table, grouped, mean_of, most_of, table_of_groups
-from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.evaluation.options import CAPTURE_ROWS, CaptureEvalOptions, CaptureRow
+from geodiff_plugin.evaluation.tables import CellOf, Table, grouped, mean_of, table_of_groups
 from geodiff_plugin.jobs.runner import Item, Record, fingerprint
 
-#: What makes a sequence, by name; a checkout registers its renderer (tests/scenes/dataset.py).
-SEQUENCES: dict[str, Any] = {}
-#: Within the first share of its depth, a point is the same in the next frame; beyond the second it is hidden.
-SAME_SURFACE, HIDDEN_SHARE = 0.01, 0.3
-#: Distance within which a point of a cloud counts as right, metres, and the clouds' grid.
-RIGHT_M, CELL_M = 0.05, 0.02
-
-
-def flicker(errors: Sequence[np.ndarray], truth: Sequence[DepthFrame]) -> tuple[float, float]:
-    """Mean change of log depth of the same surface points from frame to frame, beyond the truth's.
-
-    ``errors`` are ``(H, W)`` each, log of depth over truth; the second number is that of the frames' medians.
-    """
-    points, breath = [], []
-    for (frame, following), (before, after) in zip(pairwise(truth), pairwise(errors), strict=True):
-        row, column, z, inside = seen_in(frame, following)
-        same = inside & (np.abs(following.depth[row, column] - z) < SAME_SURFACE * z)
-        change = after[row, column][same] - before[same]
-        change = change[np.isfinite(change)]
-        points.append(np.abs(change).mean())
-        breath.append(abs(np.median(change)))
-    return float(np.mean(points)), float(np.mean(breath))
-
-
-def true_frames(sequence: Any) -> list[DepthFrame]:
-    """The left views of a sequence; NaN where there is no truth."""
-    frames = []
-    for view, pose in zip(sequence.lefts, sequence.T_world_from_left, strict=True):
-        depth = np.where(view.valid[0].numpy(), view.depth_m[0].numpy().astype(np.float64), np.nan)
-        frames.append(DepthFrame("", depth, depth, sequence.K.numpy(), pose.numpy()))
-    return frames
-
-
-def run_sequence(name: str, options: SequenceOptions) -> Page | None:
-    """Measure every way on every sequence, and write the page; errors as ``run_experiment``."""
-    if "synthetic" not in SEQUENCES:
-        cure = "A clone of the repository has them: python -m tests.scenes eval sequence ..."
-        bad_value("the sequences", "registered in evaluation.frames.SEQUENCES as 'synthetic'", "none", cure)
-    settings, priors = options.settings, PriorCache()
-    pipe, prior = priors.get(settings), priors.fingerprint(settings)
-
-    @lru_cache(maxsize=1)
-    def render(seed: int) -> Any:
-        return SEQUENCES["synthetic"](seed, options.frames, size=options.size)
-
-    cells = []
-    for seed, way in product(range(options.scenes), options.ways):
-        how = (options.frames, *options.size, options.steps, options.seed, settings.device)
-        key = fingerprint(seed, way, *how, settings.prior, prior, __version__)
-        work = partial(_measure_sequence, pipe, render, seed, way, options)
-        cells.append(Item(key, work, name=f"sequence {seed}, {way}", head={"seed": seed, "way": way}))
-    of = f"{options.frames} frames, {options.size[1]}x{options.size[0]} pixels, prior {settings.prior}"
-    remark = f"{options.scenes} rendered scenes of {of}, {options.steps} steps, seed {options.seed} each."
-    return run_experiment(name, options, "Sequences", cells, sequence_tables, lambda _: [remark])
-
-
-def _measure_sequence(pipe: Any, render: Any, seed: int, way: str, options: SequenceOptions) -> Record:
-    """AbsRel, flicker and seconds a frame of one way of going through a sequence."""
-    sequence = render(seed)
-    device, truth = pipe._execution_device, true_frames(sequence)
-    clock = time.process_time if device.type == "cpu" else time.perf_counter
-    frames, pictures, started = [], [], clock()
-    for left, right in zip(sequence.lefts, sequence.rights, strict=True):
-        guidance = GeometryGuidance(right.image_01, sequence.K.numpy(), sequence.E.numpy())
-        generator = torch.Generator("cpu").manual_seed(options.seed)
-        call = {"generator": generator, "num_inference_steps": options.steps}
-        out = pipe(left.image_01, guidance=guidance, **call)  # its result is numpy: nothing is pending
-        maps = out.prediction[0, ..., 0], out.confidence[0, ..., 0]
-        frames.append(DepthFrame("", *maps, sequence.K.numpy().astype(np.float64), np.eye(4)))
-        pictures.append(left.image_01.permute(1, 2, 0).numpy())
-    if way == "steady":
-        frames = list(steadied(scene_poses(zip(frames, pictures, strict=True)), frames.__getitem__))
-    seconds = clock() - started
-    known = [np.isfinite(true.depth) for true in truth]
-    each = zip(frames, truth, known, strict=True)
-    scores = [evaluate_depth(frame.depth, true.depth, there)["abs_rel"] for frame, true, there in each]
-    errors = [np.log(frame.depth / true.depth) for frame, true in zip(frames, truth, strict=True)]
-    moved, breath = flicker(errors, truth)
-    numbers = {"abs_rel": float(np.mean(scores)), "worst": float(np.max(scores)), "flicker": moved}
-    return {"kind": sequence.kind} | numbers | {"breath": breath, "seconds": seconds / len(truth)}
-
-
-_SEQUENCE_COLUMNS: dict[str, CellOf] = {
-    "frames": lambda group: WAYS[group[0]["way"]],
-    "AbsRel": mean_of("abs_rel", 4),
-    "worst frame": most_of("worst"),
-    "flicker %": mean_of("flicker", 2, 100.0),
-    "breathing %": mean_of("breath", 2, 100.0),
-    "s a frame": mean_of("seconds", 2),
-}
-
-
-def sequence_tables(records: Sequence[Record]) -> list[Table]:
-    """Ways by means over the sequences."""
-    note = (
-        "AbsRel in metres, without alignment. Flicker: mean absolute change of log depth of the same surface "
-        "point from one frame to the next, beyond that of the truth, in per cent; breathing: the same of the "
-        "frame's median. On a CPU seconds are those of all threads."
-    )
-    return [table_of_groups("From frame to frame", records, ("way",), _SEQUENCE_COLUMNS, note)]
-
+#: A point whose depth in the next frame differs by more than this share is hidden there, and counts not.
+HIDDEN_SHARE = 0.3
+#: Distance within which a point of a cloud counts as right, metres (Tanks and Temples' order for rooms).
+RIGHT_M = 0.05
+#: Edge of the cells in which one point of a cloud is kept, metres.
+CELL_M = 0.02
 
 _CAPTURE_COLUMNS: dict[str, CellOf] = {
     "poses": lambda group: str(group[0]["row"]),
@@ -184,9 +86,9 @@ def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
         pipe = priors.get(settings)
         how = (str(data.resolve()), names, options.prior, priors.fingerprint(settings), options.steps)
         for row, count in product(options.rows, options.neighbours):
-            title, poses, _ = CAPTURE_ROWS[row]
-            work = partial(_measure_frames, captures[poses], pipe, row, count, names, options)
-            head = {"data": str(data), "row": title, "views": str(1 + count)}
+            how_posed = CAPTURE_ROWS[row]
+            work = partial(_measure_frames, captures[how_posed.poses], pipe, how_posed, count, names, options)
+            head = {"data": str(data), "row": how_posed.title, "views": str(1 + count)}
             key = fingerprint(row, count, options.seed, __version__, *how)
             cells.append(Item(key, work, name=f"{data.name}, {row}, {1 + count} views", head=head))
         head = {"data": str(data), "row": "COLMAP's sparse points", "views": "all"}
@@ -202,16 +104,20 @@ def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
 
 
 def _measure_frames(
-    capture: Capture, pipe: Any, row: str, count: int, names: Sequence[str], options: CaptureEvalOptions
+    capture: Capture,
+    pipe: Any,
+    row: CaptureRow,
+    count: int,
+    names: Sequence[str],
+    options: CaptureEvalOptions,
 ) -> Record:
     """Depth of every frame by one row and number of neighbours, and its scores."""
-    _, poses, pose = CAPTURE_ROWS[row]
-    solved = capture.solve(poses)
+    solved = capture.solve(row.poses)
     call: dict[str, Any] = {} if options.steps is None else {"num_inference_steps": options.steps}
     frames, true_frames, known = [], [], []
     for name in names:
         with torch.no_grad():
-            out = capture.depth(pipe, name, count, seed=options.seed, knobs={"pose": pose}, **call)
+            out = capture.depth(pipe, name, count, seed=options.seed, knobs={"pose": row.pose}, **call)
         i, depth = capture.names.index(name), np.asarray(out.prediction)[0, ..., 0]
         confidence = np.ones_like(depth) if out.confidence is None else np.asarray(out.confidence)[0, ..., 0]
         truth, valid = capture.measured_depth(name)

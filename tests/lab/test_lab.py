@@ -1,0 +1,46 @@
+"""``python -m tests.lab``: the commands of ``geodiff eval`` on rendered pairs, and the laboratories."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from geodiff_plugin.cli.eval import eval_app
+from tests.lab.__main__ import LABORATORIES, PROGRAM, lab_app
+
+
+def typed(*words):
+    return CliRunner().invoke(lab_app, list(map(str, words)))
+
+
+def test_pages_name_the_command_that_made_them(tmp_path):
+    words = ("pairs", "synthetic:1@96x72", "--methods", "sgbm")
+    done = typed(*words, "--out", tmp_path)
+    assert done.exit_code == 0 and f"{PROGRAM} {' '.join(words)}" in done.stdout
+    assert json.loads((tmp_path / "table.json").read_text())["command"] == f"{PROGRAM} {' '.join(words)}"
+
+
+@pytest.mark.parametrize("name", LABORATORIES)
+def test_every_laboratory_says_what_it_takes_and_is_not_in_the_wheel(name):
+    helped = typed(name, "--help")
+    assert helped.exit_code == 0 and f"{name} [OPTIONS]" in helped.stdout
+    assert CliRunner().invoke(eval_app, [name, "--help"]).exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("trust", "--data must be given, or --rendered above 0"),
+        ("trust --rendered 1 --width 16", "--width must be between 64"),
+        ("trust --rendered 1 --kinds bent", "--kinds must be one of K-0.67"),
+        ("trust --rendered 1 --kinds unrelated", "without 'unrelated' where a pair is alone"),
+        ("strength --methods prior-fit@other", "--methods must be methods that use a prior"),
+        ("strength --methods sgbm", "--methods must be methods that use a prior"),
+        ("strength --strengths 7%", "--strengths"),
+        ("strength --data EMPTY", "--data must be a folder with pairs"),
+    ],
+)
+def test_bad_options_are_named(tmp_path, words, said):
+    (tmp_path / "empty").mkdir()
+    done = typed(*(tmp_path / "empty" if w == "EMPTY" else w for w in words.split()), "-o", tmp_path / "out")
+    assert done.exit_code == 2 and said in done.stderr

@@ -1,0 +1,220 @@
+"""Wrong calibrations made on purpose: whether a run detects them, and whether it trusts correct ones.
+
+The page is docs/reference/results-trust.md.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin._checks import InputError, bad_value, check_choice
+from geodiff_plugin.capture.agreement import DepthFrame
+from geodiff_plugin.evaluation import experiment, tables
+from geodiff_plugin.evaluation.baselines import PriorCache, Settings
+from geodiff_plugin.evaluation.baselines.guided import call_arguments, guided_configuration
+from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, find_pairs, load, some_pairs
+from geodiff_plugin.evaluation.experiment import Page, run_experiment
+from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs
+from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.jobs.runner import Item, Record
+from tests.lab.options import TrustOptions
+
+#: A depth further off than this, as a share of the truth at the median pixel, is wrong enough to be told.
+OFF = 0.2
+TRUST_NOTE = (
+    "Median error of the depth as a share of the truth; left and right exchanged, there is no truth. A wrong "
+    "focal length of a rectified pair scales the depth and changes nothing else: two views cannot show it."
+)
+#: Known points of the kinds about points: so many of the truth.
+POINTS = 200
+Change = Callable[[StereoSample, StereoSample], StereoSample]
+
+
+def _moved(sample: StereoSample, centre: np.ndarray) -> StereoSample:
+    E = sample.E.copy()
+    E[:3, 3] = centre
+    return replace(sample, E=E)
+
+
+def _scaled(sample: StereoSample, factor: float) -> StereoSample:
+    """Focal lengths of another size; the principal point stays in the middle, where it says nothing."""
+    scale = np.diag((factor, factor, 1.0))
+    return replace(sample, K_left=sample.K_left @ scale, K_right=sample.K_right @ scale)
+
+
+def _tilted(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """As if not rectified: the right camera nods by two degrees."""
+    nod = np.eye(4)
+    nod[:3, :3] = Rotation.from_euler("x", 2.0, degrees=True).as_matrix()
+    return replace(sample, E=sample.E @ nod)
+
+
+def _shifted(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """The right picture is the left one, moved: every disparity is the same."""
+    shift = max(2, sample.left.shape[1] // 20)
+    return replace(sample, right=np.roll(sample.left, -shift, axis=1), K_right=sample.K_left)
+
+
+def _as_it_is(sample: StereoSample, _: StereoSample) -> StereoSample:
+    return sample
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A calibration: what it is, how a sample comes to have it beside another sample, given points' factor.
+
+    ``points`` is what true points are multiplied by, ``None`` where no points are given.
+    """
+
+    title: str
+    change: Change = _as_it_is
+    points: float | None = None
+
+
+KINDS: dict[str, Kind] = {
+    "right": Kind("correct"),
+    "right, points": Kind("correct, points", points=1.0),
+    "swapped": Kind("left and right images exchanged", lambda s, _: replace(s, left=s.right, right=s.left)),
+    "inverse": Kind("E is world-to-camera", lambda s, _: replace(s, E=np.linalg.inv(s.E))),
+    "axis": Kind("E along y where it is along x", lambda s, _: _moved(s, s.E[[1, 0, 2], 3])),
+    "tilted": Kind("not rectified: 2 degrees of pitch", _tilted),
+    "mirrored": Kind("right image mirrored", lambda s, _: replace(s, right=s.right[:, ::-1].copy())),
+    "millimetres": Kind("baseline in millimetres", lambda s, _: _moved(s, s.E[:3, 3] * 1000.0)),
+    "thousandth": Kind("baseline divided by 1000 once too often", lambda s, _: _moved(s, s.E[:3, 3] * 0.001)),
+    "K-1.5": Kind("K of an image 1.5 times as large, centred", lambda s, _: _scaled(s, 1.5)),
+    "K-2": Kind("K of an image twice as large, centred", lambda s, _: _scaled(s, 2.0)),
+    "K-0.67": Kind("K of an image 0.67 times as large, centred", lambda s, _: _scaled(s, 0.67)),
+    "unrelated": Kind(
+        "right image of another scene",
+        lambda s, other: replace(s, right=other.right, K_right=other.K_right),
+    ),
+    "one-picture": Kind("the left image twice", lambda s, _: replace(s, right=s.left, K_right=s.K_left)),
+    "shifted": Kind("right image a shifted copy of the left one", _shifted),
+    "points-256": Kind("points in 1/256 m read as millimetres", points=0.256),
+    "points-mm": Kind("points in millimetres read as metres", points=1000.0),
+    "points-3": Kind("points 3 times too far", points=3.0),
+}
+RIGHT = [kind for kind in KINDS if kind.startswith("right")]
+WRONG = [kind for kind in KINDS if kind not in RIGHT]
+
+
+def _points(sample: StereoSample) -> np.ndarray:
+    """``(POINTS, 3)`` of the truth, metres in the left camera's frame."""
+    frame = DepthFrame("left", sample.depth_m, sample.valid, sample.K_left, np.eye(4))
+    points = frame.world(sample.valid)
+    return points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
+
+
+def _measure(ref: SampleRef, other: SampleRef, kind: str, read: Any, pipe: Any, settings: Settings) -> Record:
+    """One guided call, what was said of it, and how far it is off."""
+    original = read(ref).check_truth()
+    made = KINDS[kind]
+    sample = made.change(original, read(other))
+    points = None if made.points is None else made.points * _points(original)
+    head = {"rectified": original.rectified}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            K = sample.K_left, sample.K_right
+            guidance = GeometryGuidance(sample.right, K, sample.E, points=points)
+            out = pipe(Image.fromarray(sample.left), guidance=guidance, **call_arguments(settings))
+        except InputError as error:
+            return head | {"status": "refused", "said": [str(error)], "off": None}
+        said = [str(warning.message) for warning in caught if warning.category is UserWarning]
+    verdict, depth_m = out.verdicts[0], out.prediction[0, ..., 0]
+    said += [sentence for sentence in out.warnings if sentence not in {verdict.sentence, *verdict.remarks}]
+    errors = np.abs(depth_m[sample.valid] / sample.depth_m[sample.valid] - 1.0)
+    off = None if kind == "swapped" else float(np.median(errors))  # the truth is the other image's there
+    signs = {name: None if value != value else value for name, value in asdict(verdict.indicators).items()}
+    said += [*verdict.reasons, *verdict.remarks]
+    return head | {"status": verdict.status, "said": said, "off": off, "signs": signs}
+
+
+def _share(group: Sequence[Record], *, told: bool = True, off: bool = False) -> str:
+    """Of records, or of those whose depth is off, how many were told, or else not trusted."""
+    counted = [record for record in group if not off or record["off"] is None or record["off"] > OFF]
+    part = sum(record["status"] != "trusted" or (told and bool(record["said"])) for record in counted)
+    return f"{part} of {len(counted)} ({100 * part // len(counted)} %)" if counted else "-"
+
+
+def _median(group: Sequence[Record]) -> str:
+    known = [record["off"] for record in group if record["off"] is not None]
+    return f"{np.median(known):.2f}" if known else "-"
+
+
+_COLUMNS: dict[str, CellOf] = {
+    "given as": lambda group: KINDS[group[0]["kind"]].title,
+    "median error": _median,
+    "not trusted": partial(_share, told=False),
+    "anything said": _share,
+    f"said, of those > {OFF:.0%} off": partial(_share, off=True),
+}
+
+
+def _table(source: str, records: Sequence[Record]) -> Table:
+    """A row a kind, then all wrong ones, with and without those that two views cannot show."""
+    pairs = count_of_pairs(len({record["sample"] for record in records}), f"{source} ")
+    title = f"Wrong calibrations detected, right ones not trusted: {pairs}"
+    table = tables.table_of_groups(title, records, ("kind",), _COLUMNS, TRUST_NOTE)
+    wrong = [record for record in records if record["kind"] in WRONG]
+    # Rectified rows stay rows under any focal length.
+    seen = [record for record in wrong if not (record["rectified"] and record["kind"].startswith("K-"))]
+    sums = {"all wrong ones": wrong, "without focal lengths of rectified pairs": seen}
+    more = ((name, "", "", "", _share(group, off=True)) for name, group in sums.items())
+    return replace(table, rows=(*table.rows, *more))
+
+
+def _real_and_rendered(options: TrustOptions) -> dict[str, list[SampleRef]]:
+    """The first pairs of ``--data``, and as many rendered ones as ``--rendered`` says."""
+    if options.data is None and not options.rendered:
+        bad_value("--data", "given, or --rendered above 0", "neither")
+    real = [] if options.data is None else some_pairs(find_pairs(options.data), options.data)
+    of_size = f"synthetic:{options.rendered}@{options.width}x{options.width * 3 // 4}"
+    rendered = find_pairs(of_size, ["synthetic"]) if options.rendered else []
+    return {"real": real[: options.limit], "rendered": rendered}
+
+
+def _cells(
+    pairs: dict[str, list[SampleRef]], kinds: Sequence[str], settings: Settings, priors: PriorCache
+) -> list[Item]:
+    """A cell for every pair and kind; a pair that is alone has none of another scene."""
+    read, cells = lru_cache(maxsize=2)(load), list[Item]()
+    configuration = guided_configuration(GeometryGuidance, settings)
+    pipe, prior = priors.get(settings), f"{settings.prior} {priors.fingerprint(settings)}"
+    for source, refs in pairs.items():
+        for ref, following in zip(refs, (*refs[1:], *refs[:1]), strict=True):
+            for kind in kinds:
+                unrelated = kind == "unrelated"
+                if unrelated and len(refs) == 1:
+                    continue
+                beside = {"other": experiment.cell_key(following, "", {})} if unrelated else {}
+                head = {"kind": kind, "group": source, "sample": ref.label}
+                work = partial(_measure, ref, following if unrelated else ref, kind, read, pipe, settings)
+                key = experiment.cell_key(ref, kind, configuration | beside, prior)
+                cells.append(Item(key, work, name=f"{ref.label}, {kind}", head=head))
+    return cells
+
+
+def run(name: str, options: TrustOptions) -> Page | None:
+    """Measure, write ``trust.jsonl`` and the table; errors as ``run_experiment``."""
+    for kind in options.kinds:
+        check_choice(kind, "--kinds", WRONG)
+    wrong = options.kinds or WRONG
+    right = RIGHT if any(KINDS[kind].points for kind in wrong) else RIGHT[:1]
+    pairs = _real_and_rendered(options)
+    if "unrelated" in options.kinds and any(len(refs) == 1 for refs in pairs.values()):
+        bad_value("--kinds", "without 'unrelated' where a pair is alone", "it", "Give two pairs or more.")
+    cells = _cells(pairs, (*right, *wrong), options.settings, PriorCache())
+
+    def page_tables(records: list[Record]) -> list[Table]:
+        return [_table(source, group) for source, group in tables.grouped(records, "group").items()]
+
+    return run_experiment(name, options, "Trust", cells, page_tables)
