@@ -28,7 +28,7 @@ from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.experiment import DENSE
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.matching import consistency
-from geodiff_plugin.runtime import confidence
+from geodiff_plugin.result import confidence
 from tests.lab.options import STRENGTHS
 from tests.lab.strength import EmulatedPrior
 
