@@ -172,7 +172,11 @@ def _hardly_ordered(found: Indicators) -> bool:
 
 def _weaknesses(found: Indicators) -> tuple[bool, bool, bool]:
     """Whether share matched, confidence and rank correlation are weak."""
-    return found.matched < WEAK_MATCHED, found.confidence < WEAK_CONFIDENCE, found.rank_correlation < WEAK_CORRELATION
+    return (
+        found.matched < WEAK_MATCHED,
+        found.confidence < WEAK_CONFIDENCE,
+        found.rank_correlation < WEAK_CORRELATION,
+    )
 
 
 def _views_disagree(found: Indicators) -> bool:
@@ -231,7 +235,9 @@ def _why_disagreement(found: Indicators) -> str:
     shares = [f"{100 * found.matched:.0f} % of the left image is matched"] if few else []
     shares += [f"the mean confidence is {found.confidence:.2f}"] if unsure else []
     shares += (
-        [f"the rank correlation with the prior is {found.rank_correlation:.2f}"] if unordered and not shares else []
+        [f"the rank correlation with the prior is {found.rank_correlation:.2f}"]
+        if unordered and not shares
+        else []
     )
     return (
         f"The views hardly agree: {' and '.join(shares)}. Likely causes: E along the wrong axis or with a "
@@ -304,8 +310,9 @@ REASONS = (
         "depth.order-points",
         lambda found: found.rank_correlation < LEAST_CORRELATION and _by_points_alone(found),
         lambda found: (
-            f"The prior and the known depths disagree on near and far (rank correlation {found.rank_correlation:+.2f}): "
-            "are they metres along z in the left camera's frame, and is the space of the prior right?"
+            "The prior and the known depths disagree on near and far (rank correlation "
+            f"{found.rank_correlation:+.2f}): are they metres along z in the left camera's frame, and is the "
+            "space of the prior right?"
         ),
     ),
     Rule("depth.exchanged", lambda found: _exchanged(found) and not found.inverse_fits, _why_exchanged),
@@ -313,8 +320,9 @@ REASONS = (
         "depth.order",
         _hardly_ordered,
         lambda found: (
-            f"The prior and the matches hardly agree on near and far (rank correlation {found.rank_correlation:+.2f}): "
-            "is E, K or the order of the images wrong, or is the right image of something else?"
+            "The prior and the matches hardly agree on near and far (rank correlation "
+            f"{found.rank_correlation:+.2f}): is E, K or the order of the images wrong, or is the right "
+            "image of something else?"
         ),
     ),
     Rule("pose.off-lines", lambda found: found.epipolar_px > EPIPOLAR_WRONG, _why_off_lines),

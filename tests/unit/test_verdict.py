@@ -71,7 +71,10 @@ def test_a_good_run_is_trusted_in_silence():
         ({"at_end": 0.26}, "26 % of the matches lie at an end"),
         ({"baseline_m": 0.00012}, "0.12 mm"),
         (
-            {"rank_correlation": -0.9, "doubts": (Message("camera.principal-point", "K is for another image."),)},
+            {
+                "rank_correlation": -0.9,
+                "doubts": (Message("camera.principal-point", "K is for another image."),),
+            },
             "depth: K is for another image",
         ),
         ({"off_matches": 0.4}, "differs by 49 %"),
