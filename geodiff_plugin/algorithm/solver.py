@@ -12,6 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._kernels import use_kernel
+
 #: The shorter side, in pixels, of the coarsest grid, and its conjugate-gradient steps: near enough to exact.
 COARSEST_SIDE, COARSEST_STEPS = 24, 80
 
@@ -58,6 +60,10 @@ def solve_field(system: FieldSystem, steps: int, start: Tensor | None = None) ->
 
     Without ``start``, a field near the solution, coarser grids are solved first. The work is fixed.
     """
+    if use_kernel(system.pull):
+        from geodiff_plugin.algorithm import kernels
+
+        return kernels.solve_field(system, steps, start)
     height, width = system.weight.shape[-2:]
     if start is not None:
         return _conjugate_gradients(system, start, steps)

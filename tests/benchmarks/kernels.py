@@ -3,7 +3,8 @@
     python -m tests.benchmarks.kernels
 
 Data flow: kernel, types of its arguments and constants -> machine code by Triton -> a table on standard
-output. A kernel that keeps part of its registers in memory (spills) makes the command fail.
+output. A kernel that keeps part of its registers in memory (spills) makes the command fail, and so does one
+whose programs wait for each other but would not all be on the device at the same time.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import re
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,14 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
+from geodiff_plugin.algorithm import kernels as algorithm
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.matching import kernels as matching
 
 #: Compute capabilities of an A100 and of an H100.
 ARCHITECTURES = (80, 90)
+#: Registers of a multiprocessor, on all of these.
+REGISTERS = 65_536
 _CUOBJDUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
 
 
@@ -37,6 +41,8 @@ class Compiled:
     types: str  # of the arguments that are not constants, as Triton writes them
     constants: dict[str, Any]
     warps: int
+    options: dict[str, Any] = field(default_factory=dict)  # further ones of the launch
+    resident: int = 0  # programs that must fit a multiprocessor, because they wait for each other
 
 
 def launches() -> Iterator[Compiled]:
@@ -50,6 +56,19 @@ def launches() -> Iterator[Compiled]:
         sizes = {"EVIDENCE": evidence, "BLOCK": 8, "PADDED": 128}
         name = "winner and evidence" if evidence else "winner"
         yield Compiled(name, matching.winner_kernel, winner, sizes, 4)
+    yield from _of_the_solver()
+
+
+def _of_the_solver() -> Iterator[Compiled]:
+    coarsen = 8 * "*fp32 " + 5 * " i32"
+    yield Compiled("coarser grid", algorithm.coarsen_kernel, coarsen, {"TILE": algorithm.TILE}, 4)
+    kernel, solve = algorithm.conjugate_gradients_kernel, 8 * "*fp32 " + "*i32" + 8 * " i32"
+    sizes: dict[str, Any] = {"TILE": algorithm.TILE, "ALONE": False}
+    options = {"maxnreg": algorithm.MOST_REGISTERS, "launch_cooperative_grid": True}
+    many = solve, sizes, algorithm.WARPS, options, algorithm.RESIDENT
+    yield Compiled("conjugate gradients", kernel, *many)
+    sizes = {"TILE": algorithm.SINGLE_TILE, "ALONE": True}
+    yield Compiled("conjugate gradients, one tile", kernel, solve, sizes, algorithm.SINGLE_WARPS)
 
 
 def resources(launch: Compiled, architecture: int) -> tuple[int, int]:
@@ -59,7 +78,8 @@ def resources(launch: Compiled, architecture: int) -> tuple[int, int]:
     signature = {name: types.get(name, "constexpr") for name in launch.kernel.arg_names}
     source = ASTSource(launch.kernel, signature, launch.constants)
     target = GPUTarget("cuda", architecture, 32)
-    cubin = triton.compile(source, target=target, options={"num_warps": launch.warps}).asm["cubin"]
+    options = {"num_warps": launch.warps} | launch.options
+    cubin = triton.compile(source, target=target, options=options).asm["cubin"]
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "kernel.cubin"
         file.write_bytes(cubin)
@@ -72,15 +92,19 @@ def resources(launch: Compiled, architecture: int) -> tuple[int, int]:
 def main() -> None:
     """Print the table."""
     columns = [f"sm_{each}: registers, spilled bytes" for each in ARCHITECTURES]
-    table, spilling = new_table(("kernel", "warps", *columns)), []
+    table, spilling, crowded = new_table(("kernel", "warps", *columns)), [], []
     for launch in launches():
         found = [resources(launch, architecture) for architecture in ARCHITECTURES]
         table.add_row(launch.name, str(launch.warps), *(f"{used}, {spilled}" for used, spilled in found))
         if any(spilled for _, spilled in found):
             spilling.append(launch.name)
+        if any(used * 32 * launch.warps * launch.resident > REGISTERS for used, _ in found):
+            crowded.append(launch.name)
     show(table)
     if spilling:
         raise SystemExit(f"These kernels spill registers: {', '.join(spilling)}.")
+    if crowded:
+        raise SystemExit(f"Programs of these kernels would wait for others forever: {', '.join(crowded)}.")
 
 
 if __name__ == "__main__":
