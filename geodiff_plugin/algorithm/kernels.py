@@ -21,7 +21,7 @@ from geodiff_plugin.algorithm.solver import FieldSystem
 #: Pixels of a tile and warps of a program, of grids of many tiles.
 TILE, WARPS = 512, 8
 #: The same for grids of one tile, which a program solves by itself.
-SINGLE_TILE, SINGLE_WARPS = 1024, 16
+SINGLE_TILE, SINGLE_WARPS = 1024, 8
 #: Registers of a thread at most, and programs that a multiprocessor of 65,536 registers then holds.
 MOST_REGISTERS = 64
 RESIDENT = 65_536 // (MOST_REGISTERS * 32 * WARPS)
