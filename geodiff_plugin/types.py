@@ -90,6 +90,23 @@ class CameraView(NamedTuple):
     T_right_from_left: torch.Tensor
 
 
+class PosedViews(NamedTuple):
+    """A left image, the right views that are compared with it, and their cameras; all at one scale.
+
+    ``left_01 (3, H, W)`` float32 in [0, 1] and ``K_left (3, 3)`` in pixels of it; of a chunk of samples, each
+    tensor, those of the views too, has a batch axis in front. Without a right view only points are known.
+    """
+
+    left_01: torch.Tensor
+    views: tuple[CameraView, ...]
+    K_left: torch.Tensor
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """``(H, W)`` of the left image."""
+        return self.left_01.shape[-2], self.left_01.shape[-1]
+
+
 @dataclass(frozen=True)
 class StepReport:
     """Report of one round of a guided denoising step, with one entry per sample of the batch."""

@@ -25,8 +25,6 @@ LAYER = {
     "scale": 4,
     "evidence": 5,
     "algorithm": 6,
-    "evidence.prepare": 6,
-    "evidence.inputs": 5,
     "evidence.guidance": 6,
     "priors": 7,
     "runtime": 8,

@@ -38,11 +38,10 @@ from transformers import CLIPTextModel, CLIPTokenizer
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.priors import prior_of
-from geodiff_plugin.result.output import assemble_output
 from geodiff_plugin.runtime.estimate import ProcessingGrid
 from geodiff_plugin.runtime.hooks import frozen_weights
 from geodiff_plugin.runtime.pipeline import guided_steps
-from geodiff_plugin.runtime.run import GuidedRun
+from geodiff_plugin.runtime.run import GuidedRun, RunInputs
 
 UNET = ComponentSpec("unet", UNet2DConditionModel)
 VAE = ComponentSpec("vae", AutoencoderKL)
@@ -340,7 +339,8 @@ class GeometryEvidenceStep(Block):
         call = {name: value.default for name, value in signature.parameters.items()}
         call |= {"image": block_state.image, "num_inference_steps": steps}
         grid = ProcessingGrid(block_state.content, block_state.padding)
-        block_state.geometry = GuidedRun(host, prior, guidance, evidence, call, grid, rounds)
+        inputs = RunInputs(guidance, evidence, call, grid, rounds)
+        block_state.geometry = GuidedRun(host, prior, inputs)
         block_state.guidance, block_state.call, block_state.num_inference_steps = guidance, call, steps
 
 
@@ -378,8 +378,7 @@ class MetresStep(Block):
         depth_m = _at_image_size(processor, run.metric_prediction(block_state.latents), block_state)
         run.check_finite()
         stock = MarigoldDepthOutput(depth_m, None, None)
-        guidance = block_state.guidance
-        out = assemble_output(stock, run, guidance, block_state.call, guidance.warned)
+        out = run.output(stock, block_state.guidance.warned)
         block_state.guided_output, block_state.depth_m = out, out.prediction[0, ..., 0]
         block_state.confidence = out.confidence[0, ..., 0]
         run.release()

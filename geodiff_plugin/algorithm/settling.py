@@ -1,4 +1,4 @@
-"""Find the scale of a relative map (S7.3), in this order (``_ends_of_image``).
+"""Find the scale of a relative map (S7.3), in this order (``_range_of_image``).
 
 1. ``search_scale``: near and far by lookup in the cost volume, at the first step, or at every step if too
    few matches are reliable; without a right view ``fit_to_points`` instead.
@@ -9,27 +9,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from geodiff_plugin.algorithm.terms import Objective
+from geodiff_plugin.algorithm.terms import Given, Objective
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.scale.points import depth_span, fit_to_points, ordered, refine_to_matches
-from geodiff_plugin.scale.space import AffineState, MetricMap, smooth_floor
+from geodiff_plugin.scale.space import AffineState, DepthRange, MetricMap, smooth_floor
 from geodiff_plugin.scale.volume_search import search_scale
 
-#: Metres ``(B,)`` of the nearest and of the farthest end of a map.
-_Ends = tuple[Tensor, Tensor]
+
+@dataclass(frozen=True)
+class Samples:
+    """The samples of a chunk: of which image each is, and where the prior gives a depth."""
+
+    image_of_sample: tuple[int, ...]  # samples of one image lie side by side
+    evidence: tuple[Evidence, ...]  # of the image of each sample
+    valid: Tensor | None = None  # (B, 1, h, w) bool, where matches do not decide alone; ``None`` for all
+
+    def __len__(self) -> int:
+        return len(self.image_of_sample)
+
+    @cached_property
+    def judged(self) -> tuple[Evidence, ...]:
+        """What the prior is compared with: the evidence where the prior gives a depth."""
+        if self.valid is None:
+            return self.evidence
+        return tuple(each.within(valid) for each, valid in zip(self.evidence, self.valid, strict=True))
+
+    def of_images(self) -> Iterator[slice]:
+        """The samples of every image."""
+        for image in sorted(set(self.image_of_sample)):
+            first = self.image_of_sample.index(image)
+            yield slice(first, first + self.image_of_sample.count(image))
 
 
-def span_of_points(evidence: Sequence[Evidence]) -> _Ends:
+def span_of_points(evidence: Sequence[Evidence]) -> DepthRange:
     """The nearest and the farthest point of every sample; all samples have points."""
     spans = [depth_span(points) for sample in evidence if (points := sample.points) is not None]
-    nearest, farthest = zip(*spans, strict=True)
-    return torch.stack(nearest), torch.stack(farthest)
+    nearest, farthest = map(torch.stack, zip(*spans, strict=True))
+    return DepthRange(nearest, farthest, torch.zeros_like(nearest, dtype=torch.bool))
 
 
 @torch.no_grad()
@@ -41,7 +65,7 @@ def search_one_number(x: Tensor, objective: Objective) -> tuple[AffineState, Ten
 
     def cost(g_s: Tensor) -> Tensor:
         affine = AffineState(zero, zero, g_s.expand_as(zero))
-        loss = objective(x, affine, affine, zero.view(-1, 1), zero.view(-1, 1), None)
+        loss = objective(x, Given(affine, affine, zero.view(-1, 1), zero.view(-1, 1)))
         # A scene that no right camera sees costs nothing, and must not win.
         shown = (loss.visible_fraction > 0) & (loss.visible_fraction >= config.min_visible)
         return loss.terms["photometric"].where(shown, torch.inf)
@@ -50,65 +74,54 @@ def search_one_number(x: Tensor, objective: Objective) -> tuple[AffineState, Ten
     return AffineState(zero, zero, candidates[index]), (index == 0) | (index == len(candidates) - 1)
 
 
-def settle_ends(
-    x: Tensor,
-    owners: Sequence[int],
-    evidence: Sequence[Evidence],
-    metric: MetricMap,
-    config: GuidanceConfig,
-    current: _Ends | None,
-    on_edge: Tensor | None,
-    valid: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Metres ``(B,)`` of both ends of maps ``x (B, 1, h, w)``, and whether they are on the edge of the range.
+def fit_depth_range(
+    x: Tensor, samples: Samples, metric: MetricMap, config: GuidanceConfig, current: DepthRange | None
+) -> DepthRange:
+    """The depth range of maps ``x (B, 1, h, w)``, one per sample, that their views and points agree on best.
 
-    ``evidence`` has an entry per sample, as has ``owners``, the image of each; samples of one image lie side
-    by side. ``current`` ends stay unless a better basin shows up; ``on_edge`` is the previous result or
-    ``None``; ``valid`` marks the pixels where the prior gives a depth.
+    The ``current`` range, whose ``on_edge`` is ``None`` before the first search, stays unless a better basin
+    shows up.
     """
-    results = []
-    for image in sorted(set(owners)):
-        first = owners.index(image)
-        members = slice(first, first + owners.count(image))
-        before = None if current is None else (current[0][members], current[1][members])
-        edge = None if on_edge is None else on_edge[members]
-        where = None if valid is None else valid[first : first + 1]
-        results.append(_ends_of_image(x[members], evidence[first], metric, config, before, edge, where))
-    near, far, edges = (torch.cat(parts) for parts in zip(*results, strict=True))
-    return near, far, edges
+    ranges = []
+    for members in samples.of_images():
+        before = None if current is None else current.of(members)
+        valid = None if samples.valid is None else samples.valid[members][:1]
+        evidence = samples.judged[members.start]
+        ranges.append(_range_of_image(x[members], evidence, metric, config, before, valid))
+    return DepthRange(*(torch.cat(values) for values in zip(*ranges, strict=True)))
 
 
-def _ends_of_image(
+def _range_of_image(
     x: Tensor,
     evidence: Evidence,
     metric: MetricMap,
     config: GuidanceConfig,
-    current: _Ends | None,
-    on_edge: Tensor | None,
+    current: DepthRange | None,
     valid: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """``settle_ends`` of one image."""
+) -> DepthRange:
+    """``fit_depth_range`` of one image."""
     space, floored, reliable = metric.space, smooth_floor(x), evidence.reliable
     if evidence.volume is None:
         assert evidence.points is not None  # without views there are points
-        ends = fit_to_points(x, evidence.points, metric, current)
+        near, far = fit_to_points(x, evidence.points, metric, None if current is None else current[:2])
         on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
-    elif current is not None and reliable is not None and on_edge is not None:
-        # Later steps start from the first one's ends; reliable matches show if that basin is still best.
-        ends = current
+    elif current is not None and reliable is not None and current.on_edge is not None:
+        # Later steps start from the first one's range; reliable matches show if that basin is still best.
+        near, far, on_edge = current.near_m, current.far_m, current.on_edge
     else:
-        near, far, on_edge = search_scale(
+        near, far, searched = search_scale(
             evidence.volume, floored, space, depth_range=config.depth_range, current=current, valid=valid
         )
-        ends = near, far
+        assert searched is not None  # of a search
+        on_edge = searched
     if reliable is not None and evidence.matches is not None:
         # A poor prior's true basin is shallow in raw costs; matches separate basins at that error.
-        ends = refine_to_matches(floored, evidence.matches, *ends, space)
-        ends = fit_to_points(x, reliable, metric, ends)
+        near, far = refine_to_matches(floored, evidence.matches, near, far, space)
+        near, far = fit_to_points(x, reliable, metric, (near, far))
     for target in (evidence.matches, evidence.points):
         if target is not None:
-            ends = refine_to_matches(floored, target, *ends, space)
+            near, far = refine_to_matches(floored, target, near, far, space)
     if config.depth_range is not None:
         low, high = config.depth_range
-        ends = ordered(*(v.clamp(low, high) for v in ends))
-    return *ends, on_edge
+        near, far = ordered(near.clamp(low, high), far.clamp(low, high))
+    return DepthRange(near, far, on_edge)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -12,56 +11,51 @@ from torch import Tensor
 
 from geodiff_plugin.algorithm.correction import correction_target, fit_depth, local_error, prior_error
 from geodiff_plugin.algorithm.gradients import RULES, SUMMED, FiniteWatch
-from geodiff_plugin.algorithm.settling import search_one_number, settle_ends, span_of_points
-from geodiff_plugin.algorithm.terms import Loss, Objective
+from geodiff_plugin.algorithm.member import Member
+from geodiff_plugin.algorithm.settling import Samples, fit_depth_range, search_one_number, span_of_points
+from geodiff_plugin.algorithm.terms import Given, Loss, Objective
+from geodiff_plugin.algorithm.views import chunk_views
 from geodiff_plugin.config import GuidanceConfig
-from geodiff_plugin.evidence.evidence import Evidence, chunk_views, within
 from geodiff_plugin.matching import Matches, reject_reflections
 from geodiff_plugin.scale.points import order_agreement
-from geodiff_plugin.scale.space import AffineState, MetricMap
+from geodiff_plugin.scale.space import AffineState, DepthRange, MetricMap
 from geodiff_plugin.types import StepReport
 
 
 class Trajectory:
     """State of one chunk of samples through the schedule.
 
-    ``owners`` is the image of each sample; samples of one image lie side by side. The scale search starts
-    from ``prior_range``, a metric prior's metres ``(B,)`` at ``x = 0`` and ``x = 1``. Where
-    ``valid (B, 1, h, w)`` bool is false the prior gives no depth, and matches alone decide.
+    The scale search starts from ``prior_range``, a metric prior's metres at ``x = 0`` and ``x = 1``, ``(B,)``
+    each. Where the samples are not ``valid`` the prior gives no depth, and matches alone decide.
     """
 
     affine: AffineState  # after the latest update; set by ``settle_scale``
-    kept: Tensor | None = None  # (B, 1, H, W), factor on the confidence of matches, 0 for reflections
+    reflection_weight: Tensor | None = None  # (B, 1, H, W), factor on the confidence of matches
     error: Tensor | None = None  # (B, 1, 1, 1), ``correction.prior_error`` of the first estimate
     hidden: Tensor | None = None  # (B, V, 1, H, W) bool, what the estimate hides from the right cameras
-    order: Tensor | None = None  # (B,), rank correlation of the prior's first map and matches or points
-    prior_depth: Tensor | None = None  # (B, 1, h, w) metres, a metric prior's first estimate
+    rank_correlation: Tensor | None = None  # (B,), of the prior's first map with matches or points
+    prior_depth_m: Tensor | None = None  # (B, 1, h, w) metres, a metric prior's first estimate
     on_edge: Tensor | None = None  # (B,) bool, whether the last search ended on the edge of its range
 
     def __init__(
         self,
         config: GuidanceConfig,
-        evidence: Sequence[Evidence],
-        owners: Sequence[int],
+        samples: Samples,
         space: str,
         step_latents: float = 0.0,
         prior_range: tuple[Tensor, Tensor] | None = None,
-        valid: Tensor | None = None,
     ) -> None:
-        self.config, self.owners, self.valid = config, list(owners), valid
-        samples = self._samples = [evidence[i] for i in owners]
-        self._evidence = samples  # what the prior is compared with, where it is valid
-        if valid is not None:
-            self._evidence = [within(e, v) for e, v in zip(samples, valid, strict=True)]
+        self.config, self.samples = config, samples
         self.metric = MetricMap(space, config.positive)
-        self.objective = Objective(chunk_views(samples), self.metric, config)
-        self.matches = Matches.stack([e.matches for e in samples])
-        self.points = Matches.stack([e.points for e in samples])
+        self.objective = Objective(chunk_views(samples.evidence), self.metric, config)
+        self.matches = Matches.stack([e.matches for e in samples.evidence])
+        self.points = Matches.stack([e.points for e in samples.evidence])
         pixels = math.prod(self.objective.views.size) if config.rule == SUMMED else 1
         self.latent_rule = RULES[config.rule](step_latents * pixels)
         self.scale_rule, self.shift_rule = (RULES[config.rule](config.step_affine) for _ in range(2))
-        # Sorted into nearest and farthest: for disparity x = 1 is the nearest.
-        self._prior_range = None if prior_range is None else tuple(torch.stack(prior_range).sort(0).values)
+        self._prior_range = None
+        if prior_range is not None:  # nearest and farthest: for disparity x = 1 is the nearest
+            self._prior_range = DepthRange(*torch.stack(prior_range).sort(0).values)
         self._affine_start: AffineState | None = None  # the search's result, which the loss pulls towards
         self.history: list[StepReport] = []
         self.watch = FiniteWatch()
@@ -75,10 +69,11 @@ class Trajectory:
         """Find the scale of an estimate ``x``, decoded from ``z0``; at the first one judge the matches."""
         self.note("the network's clean latent", z0)
         self.note("the decoded map", x)
-        if self._prior_range is not None and self.prior_depth is None:
-            self.prior_depth = self.metric(x, self.metric.from_range(*self._prior_range))
-        if self.order is None:
-            self.order = self._order(x)
+        if self._prior_range is not None and self.prior_depth_m is None:
+            near_m, far_m, _ = self._prior_range
+            self.prior_depth_m = self.metric(x, self.metric.from_range(near_m, far_m))
+        if self.rank_correlation is None:
+            self.rank_correlation = self._rank_correlation(x)
         self.settle_scale(x)
         self._judge_matches(x)
 
@@ -86,54 +81,55 @@ class Trajectory:
         """Search g_s and the start of scale and shift for a relative map (S7.3), or improve those in use."""
         is_first = self._affine_start is None
         if self.config.search == "volume":
-            ends = self._prior_range if is_first else self.metric.range_of(self.affine)
-            near, far, self.on_edge = settle_ends(
-                x, self.owners, self._evidence, self.metric, self.config, ends, self.on_edge, self.valid
-            )
-            self.affine = self._affine_start = self.metric.from_range(near, far)
+            current = self._prior_range
+            if not is_first:
+                current = DepthRange(*self.metric.range_of(self.affine), self.on_edge)
+            near_m, far_m, self.on_edge = fit_depth_range(x, self.samples, self.metric, self.config, current)
+            self.affine = self._affine_start = self.metric.from_range(near_m, far_m)
         elif is_first:
             if self.config.search == "one-number":
                 start, self.on_edge = search_one_number(x, self.objective)
             else:
-                start = self.metric.from_range(*span_of_points(self._samples))
-                self.on_edge = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
+                near_m, far_m, self.on_edge = span_of_points(self.samples.evidence)
+                start = self.metric.from_range(near_m, far_m)
             self.affine = self._affine_start = start
 
-    def _order(self, x: Tensor) -> Tensor:
+    def _rank_correlation(self, x: Tensor) -> Tensor:
         """Rank correlation ``(B,)`` of the prior alone with matches or points; NaN without enough of them."""
-        order = x.new_full((x.shape[0],), torch.nan)
-        for i, evidence in enumerate(self._evidence):
+        correlation = x.new_full((x.shape[0],), torch.nan)
+        for i, evidence in enumerate(self.samples.judged):
             target = evidence.matches or evidence.points
             if target is not None:
-                order[i] = order_agreement(x[i : i + 1], target, self.metric.space)
-        return order
+                correlation[i] = order_agreement(x[i : i + 1], target, self.metric.space)
+        return correlation
 
     def _judge_matches(self, x: Tensor) -> None:
         """At the first estimate: find matches that look like reflections, and measure the prior's error."""
         if self.error is not None or (self.matches is None and self.points is None):
             return
-        config, depth_m = self.config, self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
-        if self.matches is not None and self.kept is None:
-            self.kept = torch.ones_like(depth_m)
+        config, valid = self.config, self.samples.valid
+        depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
+        if self.matches is not None and self.reflection_weight is None:
+            self.reflection_weight = torch.ones_like(depth_m)
             if config.reject_reflections:
-                judged = self.matches if self.valid is None else self.matches.within(self.valid)
-                self.kept = reject_reflections(judged, depth_m)
-                if self.valid is not None:  # without a prior depth no match is a reflection
-                    inside = F.interpolate(self.valid.float(), depth_m.shape[-2:], mode="nearest-exact")
-                    self.kept = torch.where(inside > 0, self.kept, 1.0)
+                judged = self.matches if valid is None else self.matches.within(valid)
+                self.reflection_weight = reject_reflections(judged, depth_m)
+                if valid is not None:  # without a prior depth no match is a reflection
+                    inside = F.interpolate(valid.float(), depth_m.shape[-2:], mode="nearest-exact")
+                    self.reflection_weight = torch.where(inside > 0, self.reflection_weight, 1.0)
         if config.correct or config.crisp:
             target = self._target(depth_m)
             assert target is not None  # there are matches or points
-            target = target if self.valid is None else target.within(self.valid)
+            target = target if valid is None else target.within(valid)
             self.error = prior_error(depth_m, target, self.objective.views.left_01, config)
 
     def _target(self, depth_m: Tensor) -> Matches | None:
-        error = local_error(self.error, self.valid)
-        return correction_target(self.matches, self.points, self.kept, error, depth_m)
+        error = local_error(self.error, self.samples.valid)
+        return correction_target(self.matches, self.points, self.reflection_weight, error, depth_m)
 
     def find_hidden(self, x: Tensor) -> None:
         """Find the pixels that a map hides from the right cameras, for all updates of a round."""
-        compared = self.config.weights.get("photometric") and self.objective.views.further
+        compared = self.config.weights.get("photometric") and self.objective.views.views
         if self.config.z_test and compared:
             self.hidden = self.objective.hidden(x, self.affine)
 
@@ -141,7 +137,7 @@ class Trajectory:
     def corrected(self, x: Tensor) -> Tensor:
         """A relative map ``x (B, 1, h, w)`` fitted to matches and points; ``x`` where there are neither."""
         depth_m = self.objective.metric_depth(x, self.affine)
-        target, error = self._target(depth_m), local_error(self.error, self.valid)
+        target, error = self._target(depth_m), local_error(self.error, self.samples.valid)
         if target is None or error is None:
             return x
         _, _, field = fit_depth(depth_m, target, self.objective.views.left_01, error, self.config)
@@ -153,9 +149,10 @@ class Trajectory:
         """Loss of an estimate ``x``, decoded from ``z0``, whose scale is settled; as ``Objective``."""
         assert self._affine_start is not None  # the scale is settled
         matches = None  # less those that look like reflections
-        if self.matches is not None and self.kept is not None:
-            matches = replace(self.matches, confidence=self.kept * self.matches.confidence)
-        return self.objective(x, affine, self._affine_start, z0, anchor, matches, self.points, self.hidden)
+        if self.matches is not None and self.reflection_weight is not None:
+            matches = replace(self.matches, confidence=self.reflection_weight * self.matches.confidence)
+        start, points, hidden = self._affine_start, self.points, self.hidden
+        return self.objective(x, Given(affine, start, z0, anchor, matches, points, hidden))
 
     def report(self, loss: Loss | None) -> None:
         """Append a ``StepReport``; tensors stay on their device, so nothing waits for it."""
@@ -165,3 +162,35 @@ class Trajectory:
             seen = loss.visible_fraction
             report = replace(report, loss=loss.total.detach(), terms=terms, visible_fraction=seen)
         self.history.append(report)
+
+    def result(self, x: Tensor) -> Tensor:
+        """Metric depth ``(B, 1, H, W)`` of the maps of the final latents, on the padded grid."""
+        self.note("the map of the final latent", x)
+        return self.metric(x, self.affine)
+
+    def members(self, x: Tensor, depth_m: Tensor) -> list[Member]:
+        """What act 3 gets of every sample: of the maps ``x`` without padding, and of their ``result``."""
+        near_m, far_m = depth_m.amin((1, 2, 3), keepdim=True), depth_m.amax((1, 2, 3), keepdim=True)
+        members = []
+        for i in range(len(self.samples)):
+            of_sample = slice(i, i + 1)
+
+            def part(values: Tensor | None, of_sample: slice = of_sample) -> Tensor | None:
+                return None if values is None else values[of_sample]
+
+            members.append(
+                Member(
+                    self.metric,
+                    self.affine.of(of_sample),
+                    relative=x[of_sample],
+                    near_m=near_m[of_sample],
+                    far_m=far_m[of_sample],
+                    reflection_weight=part(self.reflection_weight),
+                    error=part(self.error),
+                    valid=part(self.samples.valid),
+                    rank_correlation=part(self.rank_correlation),
+                    on_edge=part(self.on_edge),
+                    prior_depth_m=part(self.prior_depth_m),
+                )
+            )
+        return members

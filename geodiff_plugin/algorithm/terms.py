@@ -16,10 +16,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.evidence.evidence import Views
-from geodiff_plugin.geometry import hidden_in_right, image_size, warp_right_to_left
+from geodiff_plugin.geometry import hidden_in_right, image_size, plane_rays, warp_right_to_left
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import AffineState, MetricMap
+from geodiff_plugin.types import PosedViews
 
 #: Pyramid levels with a shorter side than this are left out.
 MIN_SIDE = 24
@@ -144,6 +144,18 @@ def _best_explained(error: Tensor, mask: Tensor, views: int) -> tuple[Tensor, Te
     return torch.where(mask > 0, error, torch.full_like(error, UNSEEN)).amin(1), mask.amax(1)
 
 
+class Given(NamedTuple):
+    """What the loss of a relative map depends on beside the map and the views."""
+
+    affine: AffineState  # carries the graph
+    affine_start: AffineState  # the search's result
+    z0: Tensor  # (B, C, h, w) the clean latent that the map was decoded from, carries the graph
+    anchor: Tensor  # (B, C, h, w) the network's clean latent of this step, moved by its corrections
+    matches: Matches | None = None  # without reflections
+    points: Matches | None = None  # depths that the user knows
+    hidden: Tensor | None = None  # (B, V, 1, H, W) bool, pixels not to be compared
+
+
 class Compared(NamedTuple):
     """One metric estimate on the loss grid, and what the terms compare it with."""
 
@@ -247,14 +259,15 @@ class Loss(NamedTuple):
 
 
 class Objective:
-    """The weighted sum of guidance terms for one chunk of samples.
+    """The weighted sum of guidance terms for one chunk of samples, whose ``views`` have a batch axis.
 
     Below ``min_visible`` a sample's photometric term is off: a depth that pushes the scene out of the right
     image leaves nothing to compare and would win.
     """
 
-    def __init__(self, views: Views, metric: MetricMap, config: GuidanceConfig) -> None:
+    def __init__(self, views: PosedViews, metric: MetricMap, config: GuidanceConfig) -> None:
         self.views, self.metric, self.config = views, metric, config
+        self._rays = [plane_rays(views.K_left, K, T, views.size) for _, K, T in views.views]  # once a chunk
 
     def metric_depth(self, x: Tensor, affine: AffineState) -> Tensor:
         """``x (B, 1, h, w)`` resized to the loss grid, then Eq. 16: ``(B, 1, H, W)`` metres."""
@@ -263,31 +276,21 @@ class Objective:
             x = F.interpolate(x, self.views.size, mode="bilinear", align_corners=False)
         return self.metric(x, affine)
 
-    def __call__(
-        self,
-        x: Tensor,
-        affine: AffineState,
-        affine_start: AffineState,
-        z0: Tensor,
-        anchor: Tensor,
-        matches: Matches | None,
-        points: Matches | None = None,
-        hidden: Tensor | None = None,
-    ) -> Loss:
-        """Loss of one estimate; differentiable in ``x``, ``z0`` and the affine state.
+    def __call__(self, x: Tensor, given: Given) -> Loss:
+        """Loss of one estimate; differentiable in ``x``, ``given.z0`` and ``given.affine``.
 
-        ``x (B, 1, h, w)`` is the unclipped relative map without padding, decoded from ``z0``; ``hidden (B, V,
-        1, H, W)`` bool are pixels not to be compared. Other arguments as in ``Compared``.
+        ``x (B, 1, h, w)`` is the unclipped relative map without padding, decoded from ``given.z0``.
         """
-        given = {"": True, "views": self.views.further, "matches": matches, "points": points}
-        active = {name: w for name, w in self.config.weights.items() if w and given[TERMS[name].needs]}
-        depth_m = self.metric_depth(x, affine)
+        needed = {"": True, "views": self.views.views, "matches": given.matches, "points": given.points}
+        active = {name: w for name, w in self.config.weights.items() if w and needed[TERMS[name].needs]}
+        depth_m = self.metric_depth(x, given.affine)
         warps = any(TERMS[name].needs == "views" for name in active)
         with torch.set_grad_enabled(torch.is_grad_enabled() and warps):
             warped_01, in_view = self._warp(depth_m)
-        visible = in_view if hidden is None else in_view & ~hidden
+        visible = in_view if given.hidden is None else in_view & ~given.hidden
         seen = depth_m, self.views.left_01, warped_01, visible
-        compared = Compared(*seen, affine, affine_start, z0, anchor, matches, points, self.config)
+        latents = given.affine, given.affine_start, given.z0, given.anchor
+        compared = Compared(*seen, *latents, given.matches, given.points, self.config)
         visible_fraction = in_view.any(1).float().flatten(1).mean(1)
         total, values = torch.zeros_like(visible_fraction), {}
         for name, weight in active.items():
@@ -300,10 +303,10 @@ class Objective:
 
     def hidden(self, x: Tensor, affine: AffineState) -> Tensor:
         """``(B, V, 1, H, W)`` bool: what another part of this estimate hides from each right view."""
-        depth_m, v = self.metric_depth(x, affine), self.views
+        depth_m, K_left = self.metric_depth(x, affine), self.views.K_left
         hidden = [
-            hidden_in_right(depth_m, v.K_left, K, T, image_size(image), rays=rays)
-            for (image, K, T), rays in zip(v.further, v.rays, strict=True)
+            hidden_in_right(depth_m, K_left, K, T, image_size(image), rays=rays)
+            for (image, K, T), rays in zip(self.views.views, self._rays, strict=True)
         ]
         return torch.stack(hidden, 1)
 
@@ -312,7 +315,7 @@ class Objective:
         v = self.views
         warps = [
             warp_right_to_left(image, depth_m, v.K_left, K, T, rays=rays)
-            for (image, K, T), rays in zip(v.further, v.rays, strict=True)
+            for (image, K, T), rays in zip(v.views, self._rays, strict=True)
         ]
         if not warps:
             nothing = v.left_01[:, None][:, :0]

@@ -17,7 +17,9 @@ from geodiff_plugin.algorithm.terms import TERMS
 from geodiff_plugin.config import PRESETS, GuidanceConfig, UpdatePlan
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.inputs import read_inputs, split_views
-from geodiff_plugin.evidence.prepare import EstimatedRig, EvidenceStore, estimate_rig, make_evidence
+from geodiff_plugin.evidence.photographs import EstimatedRig, estimate_rig
+from geodiff_plugin.evidence.prepare import make_evidence
+from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.formats import picture_size, read_calibration
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.messages import Message

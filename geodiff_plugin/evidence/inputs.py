@@ -25,7 +25,7 @@ from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.formats import as_image_01, picture_size
 from geodiff_plugin.formats.images import warn_of_other_lens
 from geodiff_plugin.geometry import image_size
-from geodiff_plugin.types import CameraView, Rig
+from geodiff_plugin.types import CameraView, PosedViews, Rig
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +38,18 @@ class Inputs:
     points: Tensor | None  # float32 metres as ``points_to_matches`` takes them
     unit: str | None = "m"
 
-    def on(self, device: torch.device) -> tuple[list[CameraView], Tensor, Tensor | None]:
-        """The further views, ``K_left``, points: float32 on a device."""
+    def beside(self, left_01: Tensor) -> PosedViews:
+        """The left image with its right views and K, float32 on its device."""
 
         def moved(x: np.ndarray | Tensor) -> Tensor:
-            return torch.as_tensor(x, dtype=torch.float32, device=device)
+            return torch.as_tensor(x, dtype=torch.float32, device=left_01.device)
 
-        views = [CameraView(*map(moved, view)) for view in self.views]
-        return views, moved(self.K_left), None if self.points is None else moved(self.points)
+        views = tuple(CameraView(*map(moved, view)) for view in self.views)
+        return PosedViews(left_01, views, moved(self.K_left))
+
+    def points_on(self, device: torch.device) -> Tensor | None:
+        """The known depths, float32 on a device."""
+        return None if self.points is None else self.points.to(device, torch.float32)
 
 
 def read_inputs(

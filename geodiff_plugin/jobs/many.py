@@ -16,7 +16,7 @@ import torch
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.evidence.inputs import left_images
-from geodiff_plugin.evidence.prepare import EvidenceStore
+from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.formats import recordings
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import OutFolder, atomic_path, reason_of

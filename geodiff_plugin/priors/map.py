@@ -13,13 +13,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_type, bad_value
+from geodiff_plugin.algorithm.edges import sharpen_edges
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.pipeline import Condition, DirectMapPipeline, Generators
 from geodiff_plugin.priors.transformers_depth import range_of
-from geodiff_plugin.result.full_resolution import sharpen_edges
 
 #: What ``load_prior("map")`` loads: no folder is there, and none is needed.
 MAP_LAYOUT = Layout(Path(__file__).with_suffix(""), "map")

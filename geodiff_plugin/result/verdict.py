@@ -8,65 +8,65 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import torch
-import torch.nn.functional as F
-from torch import Tensor
-
-from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.formats.depth import row_strips
-from geodiff_plugin.matching import Matches
 from geodiff_plugin.messages import Message
-from geodiff_plugin.pose.mistakes import INVERSE
+from geodiff_plugin.result.indicators import POINTS_WRONG, Indicators
 
-#: Matches above this confidence count.
-CONFIDENT = 0.5
-#: Two images whose values differ by less, in [0, 1], and by less than this share of their contrast (all
-#: pictures that are nearly black differ by little), are the same picture.
-SAME, SAME_SHARE = 1.5 / 255, 0.05
-#: Least number of points that are compared with matches; radius in pixels in which a point has matches.
-FEWEST_COMPARED, REACH_PX = 12, 3
-FEWEST_MATCHES = 40
 #: A depth that differs from the matches by this in the median of the absolute log is not trusted.
 OFF_MATCHES = math.log(1.2)
-#: Log of the ratio of the 95 % and the 5 % quantile of depth below which a scene may be one plane.
-FLAT = 0.2
-#: Below this mean confidence, and this share matched, a run is not to be trusted. Right pairs, real and
-#: rendered, had .66 to .98 and .32 to .96; where nothing is matched, confidence is about .45.
-LEAST_CONFIDENCE, LEAST_MATCHED = 0.5, 0.12
+#: Below this mean confidence a result is not to be trusted. Right pairs, real and rendered, had .66 to .98;
+#: where nothing is matched, confidence is about .45.
+LEAST_CONFIDENCE = 0.5
+#: The same for the share matched, which was .32 to .96 for right pairs.
+LEAST_MATCHED = 0.12
 #: The same for the rank correlation of near and far, which was +.18 to +.97 for right pairs.
 MOST_EXCHANGED = -0.2
-#: A rank correlation below the first number is bad unless this share is matched: a poor prior may cause it.
-LEAST_ORDER, MATCHED_ENOUGH = 0.2, 0.5
-#: Two weak indicators together count as a bad one; the last is the distance to epipolar lines, in pixels.
-WEAK_CONFIDENCE, WEAK_MATCHED = 0.6, 0.4
-WEAK_ORDER, WEAK_EPIPOLAR_PX = 0.45, 1.0
+#: A lower rank correlation is bad unless ``MATCHED_ENOUGH`` is matched: a poor prior may cause it.
+LEAST_CORRELATION = 0.2
+#: Share matched from which the prior is rather to blame.
+MATCHED_ENOUGH = 0.5
+#: Below this mean confidence it is a weak indicator; two weak ones together count as a bad one.
+WEAK_CONFIDENCE = 0.6
+#: Below this share matched it is a weak one.
+WEAK_MATCHED = 0.4
+#: Below this rank correlation it is a weak one.
+WEAK_CORRELATION = 0.45
+#: Beyond this distance of matches from their epipolar lines, pixels, it is a weak one.
+WEAK_EPIPOLAR_PX = 1.0
 #: A low rank correlation is accepted if the matched depths lie within this (log of 95 % over 5 %).
 LEAST_SPREAD = 0.15
-#: Points and matches that differ by the first factor are reported; by the second, the result is not trusted.
-POINTS_REPORTED, POINTS_WRONG = math.log(1.08), math.log(1.2)
-#: Share of the points that differ by the second factor, one by one, above which this is reported, or the
-#: result not trusted. In dense maps some always do: at edges, and where a view is occluded.
-MANY_OFF, MOST_OFF = 0.25, 0.5
-#: Shortest plausible baseline, metres; plausible horizontal fields of view, degrees (135 mm and 10 mm in
-#: 35 mm equivalent). ``check_baseline`` warns of long baselines.
-LEAST_BASELINE_M, VIEWS_DEG = 1e-3, (15.0, 120.0)
+#: Points and matches that differ by this factor are reported (log); by ``POINTS_WRONG``, the result is not
+#: trusted.
+POINTS_REPORTED = math.log(1.08)
+#: Share of the points that differ by ``POINTS_WRONG``, one by one, above which this is reported. In dense
+#: maps some always do: at edges, and where a view is occluded.
+MANY_OFF = 0.25
+#: The share above which the result is not trusted: most of the points then contradict the views.
+MOST_OFF = 0.5
+#: Shortest plausible baseline, metres; ``check_baseline`` warns of long ones.
+LEAST_BASELINE_M = 1e-3
+#: Plausible horizontal fields of view, degrees: 135 mm and 10 mm in 35 mm equivalent.
+VIEWS_DEG = (15.0, 120.0)
 #: A larger ratio of the result to a metric prior's depth is reported (log).
 OWN_METRES = math.log(1.9)
-#: Distance of matches from their epipolar lines, under the best pose near the given one, that is reported,
-#: and that is not trusted; pixels of the grid of the matches.
-EPIPOLAR_PX, EPIPOLAR_WRONG = 2.0, 4.0
+#: Distance of matches from their epipolar lines, under the best pose near the given one, that is reported;
+#: pixels of the grid of the matches.
+EPIPOLAR_PX = 2.0
+#: The distance that is not trusted, twice the one that is reported.
+EPIPOLAR_WRONG = 4.0
 #: A refined pose whose scale is less certain than this is not trusted, unless known depths give the scale.
 MOST_SCALE_SPREAD = 0.1
 #: Known depths that fix a scale and a shift, and show when one of them is wrong.
 LEAST_POINTS = 3
-#: Without matches a depth is judged by so many known depths, in this share of 8x8 parts of the image: with
-#: 40 points AbsRel was .13 in the mean of six pairs, with 80 it was .10.
-ENOUGH_POINTS, LEAST_COVER = 50, 0.25
-#: A given range may be too narrow if this share of the matches lies on its first or last plane, and is if
-#: the second does.
-MOST_AT_END, TOO_MANY_AT_END = 0.05, 0.2
+#: Without matches a depth is judged by so many known depths: with 40 points AbsRel was .13 in the mean of six
+#: pairs, with 80 it was .10.
+ENOUGH_POINTS = 50
+#: They also lie in this share of 8x8 parts of the image: points in a corner say nothing about the rest.
+LEAST_COVER = 0.25
+#: A given range may be too narrow if this share of the matches lies on its first or last plane.
+MOST_AT_END = 0.05
+#: It is too narrow if this share does, four times as many.
+TOO_MANY_AT_END = 0.2
 
 #: Factor of the points over the views -> the likely cause.
 FACTORS = {
@@ -81,34 +81,6 @@ FACTORS = {
 }
 NEARLY = math.log(1.04)
 UNTESTED = "neither matches of two views nor enough known depths, all over the image, test it"
-
-
-@dataclass(frozen=True)
-class Indicators:
-    """Numbers of one image's run; NaN where unknown."""
-
-    confidence: float = math.nan  # mean of the confidence map, [0, 1]
-    matched: float = math.nan  # share of the left image with a match that both views agree on, [0, 1]
-    order: float = math.nan  # rank correlation of the prior's first map with matches or points, [-1, 1]
-    spread: float = math.nan  # of the matched depths, log of their 95 % over their 5 % quantile
-    points_ratio: float = math.nan  # median of known points over matched depths at the same places
-    points_off: float = math.nan  # share of the points that differ from the matches by 1.2 or more
-    points: int = 0  # number of known depths within the image
-    cover: float = 0.0  # share of 8x8 equal parts of the image in which they lie
-    at_end: float = 0.0  # share of the confident matches on the first or the last plane of a given range
-    baseline_m: float = 0.0  # distance of the first right camera; 0 without one, or where it has no unit
-    view_deg: float = math.nan  # horizontal field of view that K gives the left image
-    prior_ratio: float = math.nan  # median of the depth over a metric prior's depth
-    epipolar_px: float = math.nan  # median distance of matches from their epipolar lines, the worst view's
-    given_px: float = math.nan  # the same distance under the poses as given
-    scale_spread: float = math.nan  # relative standard deviation of a refined pose's scale, if in metres
-    off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
-    doubts: tuple[Message, ...] = ()  # warnings about the input, each of which forbids trust
-    mistakes: tuple[Message, ...] = ()  # of a given pose, that would explain its misfit (``pose.mistakes``)
-    flat: bool = False  # all confident matches lie within two planes, and near enough to mean something
-    same: bool = False  # the left and a right view are the same picture
-    inverse_fits: bool = False  # the inverse pose matches clearly more
-    on_edge: bool = False  # the search for the scale ended on the edge of its range
 
 
 @dataclass(frozen=True)
@@ -138,90 +110,6 @@ class Verdict:
     def trusted(self) -> bool:
         """Whether the status is ``"trusted"``."""
         return self.status == "trusted"
-
-
-def _alike(image_01: Tensor, left_01: Tensor) -> bool:
-    """Whether no value differs by more than rounding; most images differ in their first rows."""
-    if image_01.shape != left_01.shape:
-        return False
-    darkest, brightest = left_01.aminmax()
-    most, strips = min(SAME, SAME_SHARE * float(brightest - darkest)), row_strips(*left_01.shape[-2:])
-    return all(float((image_01[:, rows] - left_01[:, rows]).abs().max()) < most for rows in strips)
-
-
-def _points_indicators(matches: Matches, points: Matches) -> dict[str, float]:
-    """Median ratio of points to matched depths, and the share that differs; empty for too few of them."""
-    confident = (matches.confidence > CONFIDENT).float()
-    window = (2 * REACH_PX + 1, 1, REACH_PX)
-    near = F.avg_pool2d(confident[None], *window)[0]
-    mean = F.avg_pool2d((confident * matches.inverse_depth)[None], *window)[0] / near.clamp_min(1e-6)
-    at = (points.confidence > 0) & (near > 0) & (mean > matches.plane_step)
-    if int(at.sum()) < FEWEST_COMPARED:
-        return {}
-    ratio = mean[at] / points.inverse_depth[at]
-    off = (ratio.log().abs() > POINTS_WRONG).float().mean()
-    return {"points_ratio": float(ratio.median()), "points_off": float(off)}
-
-
-def _match_indicators(matches: Matches, depth_m: Tensor | None, planes: Tensor | None) -> dict[str, Any]:
-    """Share matched, spread of the depths, deviation of the result, share on the first or last plane."""
-    confident = matches.confidence > CONFIDENT
-    numbers: dict[str, Any] = {"matched": float(confident.float().mean())}
-    inverse_depth = matches.inverse_depth[confident & (matches.inverse_depth > 0)]
-    if len(inverse_depth) >= FEWEST_MATCHES:
-        sample = inverse_depth[:: max(1, len(inverse_depth) // 100_000)]
-        low, high = torch.quantile(sample, sample.new_tensor([0.05, 0.95]))
-        spread = float((high / low.clamp_min(1e-9)).log())
-        flat = spread < FLAT and float(high - low) < 2.0 * float(matches.plane_step)
-        numbers |= {"spread": spread, "flat": flat}
-        if planes is not None:
-            ends = (inverse_depth - planes[[0, -1], None]).abs().amin(0) < 0.75 * matches.plane_step
-            numbers["at_end"] = float(ends.float().mean())
-    at = confident & (matches.inverse_depth > matches.plane_step)
-    if depth_m is not None and int(at.sum()) >= FEWEST_MATCHES:
-        resized = F.interpolate(depth_m[None].float(), matches.size, mode="nearest-exact")[0]
-        numbers["off_matches"] = float((resized * matches.inverse_depth)[at].log().abs().median())
-    return numbers
-
-
-def read_indicators(
-    evidence: Evidence,
-    K_left: Tensor,
-    depth_m: Tensor | None = None,
-    *,
-    range_given: bool = False,
-    has_unit: bool = True,
-    **more: Any,
-) -> Indicators:
-    """The indicators of one image, of the result ``depth_m (1, H, W)``, and ``more`` that are known already.
-
-    ``K_left`` is in pixels of the native image; ``range_given``: the user gave the range of the search;
-    ``has_unit``: lengths are in metres, so that the length of a baseline means something.
-    """
-    matches, pose, rights = evidence.matches, evidence.pose, evidence.native_views
-    if matches is not None:
-        planes = evidence.volume.inverse_depth if range_given and evidence.volume is not None else None
-        more |= _match_indicators(matches, depth_m, planes)
-        if evidence.points is not None:
-            more |= _points_indicators(matches, evidence.points)
-    if pose is not None:
-        for name, residuals in (("epipolar_px", pose.residual_px), ("given_px", pose.residual_px_given)):
-            more[name] = max((px for px in residuals if not math.isnan(px)), default=math.nan)
-        if pose.status == "mistaken":
-            more["mistakes"] = tuple(m for m in pose.warnings if m.code != INVERSE.code)
-    if evidence.points is not None:
-        known = (evidence.points.confidence > 0).float()
-        more |= {"points": int(known.sum()), "cover": float(F.adaptive_max_pool2d(known, 8).mean())}
-    if rights and has_unit:
-        more["baseline_m"] = float(rights[0].T_right_from_left[:3, 3].norm())
-        more["scale_spread"] = (pose and pose.scale_spread) or math.nan
-    width = evidence.native_left.shape[-1]
-    return Indicators(
-        **more,
-        view_deg=2.0 * math.degrees(math.atan(0.5 * width / float(K_left[0, 0]))),
-        same=any(_alike(view.image_01, evidence.native_left) for view in rights),
-        inverse_fits=any(message.code == INVERSE.code for message in evidence.warnings),
-    )
 
 
 def points_agreement(found: Indicators) -> float:
@@ -274,17 +162,21 @@ def _points_contradict(found: Indicators) -> bool:
 
 
 def _exchanged(found: Indicators) -> bool:
-    return found.order < MOST_EXCHANGED and _depths_vary(found) and not _by_points_alone(found)
+    return found.rank_correlation < MOST_EXCHANGED and _depths_vary(found) and not _by_points_alone(found)
 
 
 def _hardly_ordered(found: Indicators) -> bool:
-    low = MOST_EXCHANGED <= found.order < LEAST_ORDER and not found.inverse_fits
+    low = MOST_EXCHANGED <= found.rank_correlation < LEAST_CORRELATION and not found.inverse_fits
     return low and _depths_vary(found) and not (_by_points_alone(found) or _well_matched(found))
 
 
 def _weaknesses(found: Indicators) -> tuple[bool, bool, bool]:
     """Whether share matched, confidence and rank correlation are weak."""
-    return found.matched < WEAK_MATCHED, found.confidence < WEAK_CONFIDENCE, found.order < WEAK_ORDER
+    return (
+        found.matched < WEAK_MATCHED,
+        found.confidence < WEAK_CONFIDENCE,
+        found.rank_correlation < WEAK_CORRELATION,
+    )
 
 
 def _views_disagree(found: Indicators) -> bool:
@@ -343,7 +235,9 @@ def _why_disagreement(found: Indicators) -> str:
     shares = [f"{100 * found.matched:.0f} % of the left image is matched"] if few else []
     shares += [f"the mean confidence is {found.confidence:.2f}"] if unsure else []
     shares += (
-        [f"the rank correlation with the prior is {found.order:.2f}"] if unordered and not shares else []
+        [f"the rank correlation with the prior is {found.rank_correlation:.2f}"]
+        if unordered and not shares
+        else []
     )
     return (
         f"The views hardly agree: {' and '.join(shares)}. Likely causes: E along the wrong axis or with a "
@@ -414,10 +308,11 @@ REASONS = (
     ),
     Rule(
         "depth.order-points",
-        lambda found: found.order < LEAST_ORDER and _by_points_alone(found),
+        lambda found: found.rank_correlation < LEAST_CORRELATION and _by_points_alone(found),
         lambda found: (
-            f"The prior and the known depths disagree on near and far (rank correlation {found.order:+.2f}): "
-            "are they metres along z in the left camera's frame, and is the space of the prior right?"
+            "The prior and the known depths disagree on near and far (rank correlation "
+            f"{found.rank_correlation:+.2f}): are they metres along z in the left camera's frame, and is the "
+            "space of the prior right?"
         ),
     ),
     Rule("depth.exchanged", lambda found: _exchanged(found) and not found.inverse_fits, _why_exchanged),
@@ -425,8 +320,9 @@ REASONS = (
         "depth.order",
         _hardly_ordered,
         lambda found: (
-            f"The prior and the matches hardly agree on near and far (rank correlation {found.order:+.2f}): "
-            "is E, K or the order of the images wrong, or is the right image of something else?"
+            "The prior and the matches hardly agree on near and far (rank correlation "
+            f"{found.rank_correlation:+.2f}): is E, K or the order of the images wrong, or is the right "
+            "image of something else?"
         ),
     ),
     Rule("pose.off-lines", lambda found: found.epipolar_px > EPIPOLAR_WRONG, _why_off_lines),

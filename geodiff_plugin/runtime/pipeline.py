@@ -14,17 +14,19 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, noted, refuse, warn
+from geodiff_plugin.algorithm.prompt import depth_prompt
 from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.priors import DepthPrior, prior_of
 from geodiff_plugin.priors.pipeline import RESAMPLING, DepthDiffusionPipeline
-from geodiff_plugin.result.output import assemble_output, ensemble_metric, image_labels
+from geodiff_plugin.result.ensemble import ensemble_metric
+from geodiff_plugin.result.output import image_labels
 from geodiff_plugin.runtime.estimate import ProcessingGrid, tiny_autoencoder
 from geodiff_plugin.runtime.hooks import Exclusive, networks_of
 from geodiff_plugin.runtime.noise_levels import check_scheduler
-from geodiff_plugin.runtime.run import GuidedRun, StepCallback, depth_prompt
+from geodiff_plugin.runtime.run import GuidedRun, RunInputs, StepCallback
 
 #: What every stock pipeline's call takes, whatever the prior.
 STOCK_ARGUMENTS = (
@@ -91,7 +93,7 @@ class GuidedCall(_Stock):
                 call = _bind(super().__call__, image, *args, **kwargs)
                 run, stock = self._call_guided(call, guidance, callback_on_step_end, held)
                 with torch.autocast(self._execution_device.type, enabled=False):
-                    output = assemble_output(stock, run, guidance, call, distinct(guidance.warned, warned))
+                    output = run.output(stock, distinct(guidance.warned, warned))
         labelled = zip(image_labels(len(output.verdicts)), output.verdicts, strict=True)
         untrusted = " ".join(label + verdict.sentence for label, verdict in labelled if not verdict.trusted)
         if strict and untrusted:
@@ -126,7 +128,8 @@ class GuidedCall(_Stock):
         # Channels last, as the stock call reads pictures; with given latents Marigold does not accept it.
         layout = torch.channels_last if call["latents"] is None else torch.contiguous_format
         call["image"] = lefts_01.contiguous(memory_format=layout)
-        run = GuidedRun(self, prior, guidance, evidence, call, grid, rounds, callback, tiny, held)
+        inputs = RunInputs(guidance, evidence, call, grid, rounds)
+        run = GuidedRun(self, prior, inputs, callback, tiny, held)
         try:
             with run:
                 fixed = {"return_dict": True, "output_latent": True, "output_type": "pt"}
@@ -160,7 +163,6 @@ class GuidedCall(_Stock):
         """Stock ensembling; while guided, the median of members that are in metres already."""
         if self._guided_run is None:
             return super().ensemble_depth(depth, *args, **kwargs)
-        self._guided_run.members.append(depth)
         lower = self._guided_run.config.even_ensemble == "lower"
         return ensemble_metric(depth, kwargs.get("reduction", "median"), lower)
 

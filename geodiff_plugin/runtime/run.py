@@ -4,88 +4,76 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-import torch.nn.functional as F
+from diffusers.pipelines.marigold import MarigoldDepthOutput
 from torch import Tensor
 from tqdm.auto import tqdm
 
 from geodiff_plugin._checks import bad_type, bad_value
-from geodiff_plugin.algorithm.correction import fit_depth, local_error, prior_error
+from geodiff_plugin.algorithm.member import Member
 from geodiff_plugin.algorithm.schedule import Schedule, make_schedule
+from geodiff_plugin.algorithm.settling import Samples
 from geodiff_plugin.algorithm.state import Trajectory
 from geodiff_plugin.algorithm.step import guided_step
-from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.geometry import image_size
-from geodiff_plugin.matching import Matches, with_points
+from geodiff_plugin.messages import Message
 from geodiff_plugin.priors import DepthPrior
+from geodiff_plugin.result.finish import ResultOptions, finish
+from geodiff_plugin.result.output import stack_results
 from geodiff_plugin.runtime import hooks
 from geodiff_plugin.runtime.estimate import MapCodec, ProcessingGrid, StepEstimate, StepInputs
 from geodiff_plugin.runtime.noise_levels import noise_level
+from geodiff_plugin.types import MetricDepthOutput
 
 StepCallback = Callable[[Any, int, Any, dict[str, Tensor | None]], dict[str, Tensor] | None]
 
-#: Longer side of the depth prompt, pixels.
-PROMPT_LONG_EDGE = 256
 
+@dataclass(frozen=True)
+class RunInputs:
+    """What a guided call starts from: act 1's evidence, and the stock call that act 2 runs in."""
 
-def depth_prompt(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor | None:
-    """``(N, 1, h, w)`` metres: flat maps corrected by matches and points; ``None`` if one image has none."""
-    maps = []
-    for image in evidence:
-        confident, points = Matches.stack([image.reliable]), Matches.stack([image.points])
-        target = confident if points is None else with_points(confident, points)
-        if target is None:
-            return None
-        height, width = image_size(image.left_01)
-        factor = min(1.0, PROMPT_LONG_EDGE / max(height, width))
-        size = max(1, round(height * factor)), max(1, round(width * factor))
-        median = 1.0 / target.inverse_depth[target.confidence > 0].median()
-        flat, left = median.expand(1, 1, height, width), image.left_01[None]
-        error = prior_error(flat, target, left, config=config)
-        depth_m, _, _ = fit_depth(flat, target, left, error, config=config)
-        maps.append(F.interpolate(depth_m, size, mode="bilinear", antialias=True))
-    return torch.cat(maps)
+    guidance: GeometryGuidance
+    evidence: Sequence[Evidence]  # one per image
+    call: Mapping[str, Any]  # arguments of the stock call
+    grid: ProcessingGrid
+    rounds: int = 1  # in each denoising step
 
 
 class GuidedRun:
-    """State of one guided call, whose stock arguments are ``call``, with ``rounds`` in each denoising step.
+    """State of one guided call.
 
-    ``held``, the locks of the call, are released while the ``callback`` runs.
+    ``tiny`` is the autoencoder in place of the pipeline's. ``held``, the locks of the call, are released
+    while the ``callback`` runs.
     """
 
     def __init__(
         self,
         pipe: Any,
         prior: DepthPrior,
-        guidance: GeometryGuidance,
-        evidence: list[Evidence],
-        call: Mapping[str, Any],
-        grid: ProcessingGrid,
-        rounds: int,
+        inputs: RunInputs,
         callback: StepCallback | None = None,
         tiny: Any | None = None,
         held: hooks.Exclusive | None = None,
     ) -> None:
-        self.pipe, self.prior, self.config, self.evidence = pipe, prior, guidance.config, evidence
-        self.owners = [i for i in range(len(evidence)) for _ in range(call["ensemble_size"])]
-        self.batch_size, self.grid = call["batch_size"], grid
+        guidance, call = inputs.guidance, inputs.call
+        self.pipe, self.prior, self.config, self.inputs = pipe, prior, guidance.config, inputs
+        self._image_of_sample = [i for i in range(len(inputs.evidence)) for _ in range(call["ensemble_size"])]
         self.schedule: Schedule | None = None
         self.trajectories: list[Trajectory] = []  # one per chunk
-        self.relative: list[Tensor] = []  # decoded maps of the final latents, one per chunk, not padded
-        self.members: list[Tensor] = []  # of every image with an ensemble, (E, 1, H, W) metres, not padded
-        self._plan, self._rounds = guidance.updates, rounds
+        self.members: list[Member] = []  # of all images, those of one image side by side
+        self._plan = guidance.updates
         self._callback, self._held = callback, held
         self._reads_latents = call["output_latent"] or callback is not None
-        self._codec = MapCodec(pipe, prior, grid, tiny)
+        self._codec = MapCodec(pipe, prior, inputs.grid, tiny)
         self._step = 0
         self._timesteps: list[float] = []
         self._shown: Tensor | None = None  # relative map of the chunk's latest evaluation
         self._results: list[Tensor | None] = []  # of every chunk, the map that its output starts from
-        self._ends_m: list[tuple[Tensor, Tensor]] = []  # nearest and farthest of the final maps of a chunk
+        self._decoded = 0  # chunks whose final latents were decoded
         self._stack, self._bar = ExitStack(), None
         self._tap = None
         if guidance.through_network and prior.network_input is not None:
@@ -127,49 +115,41 @@ class GuidedRun:
 
     def metric_prediction(self, latents: Tensor) -> Tensor:
         """Metric depth ``(B, 1, H, W)`` of the next chunk of final latents, on the padded processing grid."""
-        chunk = len(self.relative)
-        trajectory, x = self.trajectories[chunk], self._results[chunk]
+        trajectory, x = self.trajectories[self._decoded], self._results[self._decoded]
+        self._decoded += 1
         if x is None:  # otherwise skip decoding, which adds the autoencoder's loss
             x = self.prior.decode(latents[:, self.prior.depth_channels]).float()
-        x = self.grid.padded(x)
-        self.relative.append(self.grid.cropped(x))
-        trajectory.note("the map of the final latent", x)
-        depth_m = trajectory.metric(x, trajectory.affine)
-        self._ends_m.append((depth_m.amin((1, 2, 3), keepdim=True), depth_m.amax((1, 2, 3), keepdim=True)))
+        grid = self.inputs.grid
+        x = grid.padded(x)
+        depth_m = trajectory.result(x)
+        self.members += trajectory.members(grid.cropped(x), depth_m)
         return depth_m
 
-    def within_range(self, depth_m: Tensor, image: int | None = None) -> Tensor:
-        """Clamp maps of all images, or of one image's members, to their range before resizing (overshoot)."""
-        samples = [i for i, owner in enumerate(self.owners) if image in (None, owner)]
-        near_m, far_m = (
-            torch.cat(ends).to(depth_m)[samples].view(len(depth_m), -1, 1, 1)
-            for ends in zip(*self._ends_m, strict=True)
-        )
-        return depth_m.clamp_(near_m.amin(1, keepdim=True), far_m.amax(1, keepdim=True))
+    def output(self, stock: MarigoldDepthOutput, warned: Sequence[Message]) -> MetricDepthOutput:
+        """Act 3, from the stock call's output, whose maps are in metres.
 
-    def samples_of(self, image: int) -> list[tuple[Trajectory, int]]:
-        """The samples of an image, each as its trajectory and its index there."""
-        return [(t, i) for t in self.trajectories for i, owner in enumerate(t.owners) if owner == image]
-
-    def kept_and_error(self, image: int, member: int | None = None) -> tuple[Tensor | None, Tensor | None]:
-        """``Trajectory.kept`` and the ``local_error`` of one member, or their means over all members.
-
-        ``(1, 1, h, w)`` each, ``None`` where not measured.
+        ``warned`` are the warnings so far; those that forbid trust are reasons of the verdict.
         """
-        samples = self.samples_of(image)
-        chosen = samples if member is None else samples[member : member + 1]
-
-        def mean(name: str) -> Tensor | None:
-            values = [value[i].float() for t, i in chosen if (value := getattr(t, name)) is not None]
-            return torch.stack(values).mean(0, keepdim=True) if values else None
-
-        return mean("kept"), local_error(mean("error"), mean("valid"))
-
-    def prior_error(self) -> Tensor | None:
-        """Error of the prior in log depth; ``None`` unless ``kept_and_error`` has it for every image."""
-        errors = [self.kept_and_error(i)[1] for i in range(len(self.evidence))]
-        known = [error for error in errors if error is not None]
-        return torch.cat(known) if len(known) == len(errors) else None
+        guidance, call = self.inputs.guidance, self.inputs.call
+        size, count = call["ensemble_size"], len(self.inputs.evidence)
+        members = [self.members[first : first + size] for first in range(0, count * size, size)]
+        options = ResultOptions(
+            self.config,
+            resampling=call["resample_method_output"],
+            reduction=(call["ensembling_kwargs"] or {}).get("reduction", "median"),
+            has_unit=guidance.unit is not None,
+            doubts=tuple(message for message in warned if message.forbids_trust),
+        )
+        spreads = [None] * count if stock.uncertainty is None else stock.uncertainty.split(1)
+        of_images = zip(self.inputs.evidence, members, stock.prediction.split(1), spreads, strict=True)
+        return stack_results(
+            [finish(*of_image, options) for of_image in of_images],
+            guidance,
+            [report for trajectory in self.trajectories for report in trajectory.history],
+            remarks=[message for message in warned if not message.forbids_trust],  # others are reasons
+            extras=getattr(stock, "extras", {}),
+            as_numpy=call["output_type"] != "pt",
+        )
 
     def check_finite(self) -> None:
         """Raise ``InputError`` on the first tensor of the loop that was not finite; once, after the loop."""
@@ -178,27 +158,27 @@ class GuidedRun:
 
     def begin(self, timesteps: Tensor) -> None:
         """Start the trajectory of the next chunk, with its timesteps on the CPU."""
-        first = len(self.trajectories) * self.batch_size
-        chunk = slice(first, first + self.batch_size)
+        size = self.inputs.call["batch_size"]
+        first = len(self.trajectories) * size
+        chunk = slice(first, first + size)
         plan, prior, metres = self._plan, self.prior, self.prior.metric_range
+        images = self._image_of_sample[chunk]
+        samples = Samples(
+            tuple(images),
+            tuple(self.inputs.evidence[i] for i in images),
+            None if prior.valid is None else prior.valid[chunk],
+        )
+        prior_range = None if metres is None else (metres[chunk, 0], metres[chunk, 1])
         self.trajectories.append(
-            Trajectory(
-                self.config,
-                self.evidence,
-                self.owners[chunk],
-                prior.space,
-                step_latents=plan.step_latents,
-                prior_range=None if metres is None else (metres[chunk, 0], metres[chunk, 1]),
-                valid=None if prior.valid is None else prior.valid[chunk],
-            )
+            Trajectory(self.config, samples, prior.space, plan.step_latents, prior_range)
         )
         self._results.append(None)
         self._step, self._timesteps, self._shown = 0, timesteps.tolist(), None
         if self.schedule is None:
-            encodes, count = self._tap is None, len(timesteps)
-            self.schedule = make_schedule(self.config, plan, count, rounds=self._rounds, encodes=encodes)
+            rounds, encodes = self.inputs.rounds, self._tap is None
+            self.schedule = make_schedule(self.config, plan, len(timesteps), rounds=rounds, encodes=encodes)
             options = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
-            chunks = -(-len(self.owners) // self.batch_size)
+            chunks = -(-len(self._image_of_sample) // size)
             self._bar = tqdm(total=chunks * len(timesteps), **options)
 
     def guide(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> StepInputs:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
@@ -48,6 +49,11 @@ class AffineState:
     g_s: Tensor
     units: tuple[Tensor, Tensor] | None = None
 
+    def of(self, samples: slice) -> Self:
+        """The state of some samples."""
+        units = None if self.units is None else (self.units[0][samples], self.units[1][samples])
+        return type(self)(self.s_hat[samples], self.t_hat[samples], self.g_s[samples], units)
+
     @property
     def scale(self) -> Tensor:
         """``softplus(s_hat)``, or ``s_hat^2`` times its unit; dimensionless."""
@@ -57,6 +63,22 @@ class AffineState:
     def shift(self) -> Tensor:
         """``softplus(t_hat)``, or ``t_hat^2`` times its unit; dimensionless."""
         return F.softplus(self.t_hat) if self.units is None else self.t_hat**2 * self.units[1]
+
+
+class DepthRange(NamedTuple):
+    """Metres ``(B,)`` of the nearest and of the farthest end of maps.
+
+    ``on_edge (B,)`` bool says whether they lie on the edge of what was searched; ``None``: not searched.
+    """
+
+    near_m: Tensor
+    far_m: Tensor
+    on_edge: Tensor | None = None
+
+    def of(self, samples: slice) -> DepthRange:
+        """The range of some samples."""
+        on_edge = None if self.on_edge is None else self.on_edge[samples]
+        return DepthRange(self.near_m[samples], self.far_m[samples], on_edge)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.matching import CostVolume
-from geodiff_plugin.scale.space import SPACES
+from geodiff_plugin.scale.space import SPACES, DepthRange
 
 #: Cost beyond which a pixel is an outlier: occluded, a reflection, or wrong in the prior.
 COST_CLAMP = 0.35
@@ -77,9 +77,9 @@ def search_scale(
     space: str,
     *,
     depth_range: tuple[float, float] | None = None,
-    current: tuple[Tensor, Tensor] | None = None,
+    current: DepthRange | None = None,
     valid: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> DepthRange:
     """Depths of the two ends of relative maps that the two views agree on best, ``(B,)`` metres each.
 
     1128 pairs (near, far), log-spaced, then two finer grids around the best. With them comes whether the best
@@ -90,7 +90,7 @@ def search_scale(
         x: ``(B, 1, h, w)`` relative maps of that image, about [0, 1], >= 0.
         space: what ``x`` is affine in, key of ``SPACES``.
         depth_range: metres, bounds of the search; by default ``volume.reach_m``.
-        current: nearest and farthest depth in use, ``(B,)`` each, kept unless a better basin shows up.
+        current: the range in use, kept unless a better basin shows up.
         valid: ``(1, 1, H, W)`` bool, the pixels of the maps that count; ``None`` for all.
 
     Source: S7.3. Deviation: two numbers instead of one, clamped census cost instead of L_geo.
@@ -123,7 +123,7 @@ def search_scale(
         groups = group_pixels(row, cost, in_view)
         near, far, mean = _coarse_to_fine(partial(best_of, groups), low, high, row)
         if current is not None:
-            a, c = (v[b : b + 1] for v in current)
+            a, c = (v[b : b + 1] for v in current[:2])
             now = best_of(groups, torch.minimum(a, c), torch.maximum(a, c))
             kept = now[2] <= mean + KEEP_MARGIN
             near, far, mean = (
@@ -132,8 +132,7 @@ def search_scale(
         # The volume's near end lies nearer than any match, so only a given range can cut the scene off.
         on_edge = (far >= high * 0.98) | ((near <= low * 1.02) & (depth_range is not None))
         results.append((near, far, on_edge))
-    near, far, on_edge = (torch.cat(column) for column in zip(*results, strict=True))
-    return near, far, on_edge
+    return DepthRange(*(torch.cat(column) for column in zip(*results, strict=True)))
 
 
 def _coarse_to_fine(

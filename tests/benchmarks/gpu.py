@@ -64,7 +64,7 @@ STAGES = (
     "  refine_to_matches",
     "prior_error",
     "fit_depth",
-    "assemble_output",
+    "GuidedRun.output",
     "  sharpen_edges",
     "  vote_depth",
     "    match_rows",

@@ -20,11 +20,13 @@ from geodiff_plugin.algorithm.correction import (
     off_edges,
     prior_error,
 )
+from geodiff_plugin.algorithm.edges import sharpen_edges
 from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.schedule import make_schedule
-from geodiff_plugin.algorithm.terms import Objective, match_exposure, photometric, ssim
+from geodiff_plugin.algorithm.terms import Given, Objective, match_exposure, photometric, ssim
+from geodiff_plugin.algorithm.views import chunk_views
 from geodiff_plugin.config import DEFAULT, MARIGOLD_DC, PAPER, UpdatePlan
-from geodiff_plugin.evidence.evidence import chunk_views, prepare_evidence
+from geodiff_plugin.evidence.prepare import prepare_evidence
 from geodiff_plugin.formats.images import intrinsics_from_exif
 from geodiff_plugin.geometry import hidden_in_right, is_rectified, project, resize_image, warp_right_to_left
 from geodiff_plugin.matching import build_cost_volume, points_to_matches, with_points
@@ -35,7 +37,7 @@ from geodiff_plugin.pose.estimate import find_scale
 from geodiff_plugin.pose.refine import Displacement, fit_displacement, refined_scale, straightened
 from geodiff_plugin.pose.tracks import Tracks, project_tracks, solve_inverse_depth
 from geodiff_plugin.result.confidence import depth_confidence, reprojection
-from geodiff_plugin.result.full_resolution import sharpen_edges, vote_depth
+from geodiff_plugin.result.voting import vote_depth
 from geodiff_plugin.scale.points import (
     depth_span,
     fit_to_points,
@@ -43,9 +45,9 @@ from geodiff_plugin.scale.points import (
     refine_to_matches,
     reliable_matches,
 )
-from geodiff_plugin.scale.space import SPACES, MetricMap
+from geodiff_plugin.scale.space import SPACES, DepthRange, MetricMap
 from geodiff_plugin.scale.volume_search import search_scale
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PosedViews
 from tests.conftest import textured
 
 SIZE, SIZES = (60, 88), ((72, 80), (54, 96))
@@ -217,7 +219,7 @@ def searched() -> dict[str, object]:
         "free": {},
         "given": {"depth_range": (4.0, 8.0)},
         "valid": {"valid": valid},
-        "kept": {"current": (torch.tensor([3.1]), torch.tensor([13.0]))},
+        "kept": {"current": DepthRange(torch.tensor([3.1]), torch.tensor([13.0]))},
     }
     for name, options in asked.items():
         for space, values in (("disparity", x), ("depth", 1.0 - x), ("log", 1.0 - x)):
@@ -324,7 +326,7 @@ def reflections() -> dict[str, object]:
 def losses() -> dict[str, object]:
     left, _, K, views = scene()
     depth_m, metric = prior()[0], MetricMap("disparity")
-    evidence = prepare_evidence(left, views, K, _points(), DEFAULT, needs_matches=True)
+    evidence = prepare_evidence(PosedViews(left, tuple(views), K), _points(), DEFAULT, needs_matches=True)
     x = _nearness(depth_m)
     affine, start = (
         metric.from_range(*(torch.tensor([end]) for end in ends)) for ends in ((3.0, 11.0), (2.8, 13.0))
@@ -336,7 +338,8 @@ def losses() -> dict[str, object]:
     unseen = replace(DEFAULT, min_visible=0.99)
     for name, base in (("default", DEFAULT), ("paper", PAPER), ("dc", MARIGOLD_DC), ("unseen", unseen)):
         objective = Objective(chunk_views([evidence]), metric, replace(base, weights=weights))
-        loss = objective(x, affine, start, z0, anchor, *stacked, hidden=objective.hidden(x, affine))
+        given = Given(affine, start, z0, anchor, *stacked, objective.hidden(x, affine))
+        loss = objective(x, given)
         result |= {f"{name}_{key}": value for key, value in loss.terms.items()} | {
             f"{name}_total": loss.total
         }
@@ -392,7 +395,7 @@ def finished() -> dict[str, object]:
     rectified = CameraView(torch.roll(left, -6, -1), K, T)
     for e in (0.03, 0.12):
         error = torch.full((1, 1, 1, 1), e)
-        voted_m = vote_depth(depth_m, left[None], K, [*views, rectified], target, error)
+        voted_m = vote_depth(depth_m, PosedViews(left, (*views, rectified), K), target, error)
         result[f"voted_{e}"] = (voted_m / depth_m).log()
     return result
 
@@ -513,13 +516,14 @@ def exif() -> dict[str, object]:
 def intermediate_images() -> dict[str, object]:
     """Evidence of a call whose grid is smaller than its images."""
     left, _, K, views = scene()
-    evidence = prepare_evidence(left, views, K, _points(), replace(DEFAULT, sweep_pixels=64 * 48), True)
+    config = replace(DEFAULT, sweep_pixels=64 * 48)
+    evidence = prepare_evidence(PosedViews(left, tuple(views), K), _points(), config, needs_matches=True)
     assert evidence.matches is not None and evidence.points is not None
     return {
-        "left": evidence.left_01,
-        "K": evidence.K_left,
-        "right": evidence.views[1].image_01,
-        "K_right": evidence.views[1].K,
+        "left": evidence.grid.left_01,
+        "K": evidence.grid.K_left,
+        "right": evidence.grid.views[1].image_01,
+        "K_right": evidence.grid.views[1].K,
         "confidence": evidence.matches.confidence,
         "inverse_depth": evidence.matches.inverse_depth[evidence.matches.confidence > 0.5],
         "points": evidence.points.inverse_depth,

@@ -4,14 +4,12 @@ import pytest
 import torch
 
 from geodiff_plugin.algorithm.denoising import NoiseLevel, noise_from, output_from, z0_from
-from geodiff_plugin.algorithm.terms import Objective
+from geodiff_plugin.algorithm.terms import Given, Objective
 from geodiff_plugin.config import GuidanceConfig
-from geodiff_plugin.evidence.evidence import Views
-from geodiff_plugin.geometry import plane_rays
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.priors.marigold import MarigoldPrior
 from geodiff_plugin.scale.space import AffineState, MetricMap
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PosedViews
 
 WEIGHTS = {"photometric": 1.0, "matches": 0.3, "points": 0.1, "prior_pull": 0.01, "anchor": 0.2}
 CONFIG = GuidanceConfig(weights=WEIGHTS, pyramid_levels=2, pull_to="zero", min_visible=0.0)
@@ -29,7 +27,7 @@ def views_of(pair):
     below = T.clone()
     below[:, 1, 3] = -0.1
     rights = tuple(CameraView(right, K, pose) for pose in (T, below))
-    return Views(left, K, rights, tuple(plane_rays(K, K, pose, (48, 64)) for pose in (T, below)))
+    return PosedViews(left, rights, K)
 
 
 @pytest.mark.parametrize("space", ["depth", "disparity", "log", "sqrt_disparity"])
@@ -56,7 +54,8 @@ def test_whole_chain_against_finite_differences(make_pipeline, textured_plane, s
         )
         z0 = z0_from(output, z, level)
         affine = AffineState(s_hat, t_hat, start.g_s)
-        return objective(prior.decode(z0), affine, start, z0, anchor, matches, points).total.sum()
+        given = Given(affine, start, z0, anchor, matches, points)
+        return objective(prior.decode(z0), given).total.sum()
 
     inputs = [z_t.requires_grad_(), *(x.clone().requires_grad_() for x in (start.s_hat, start.t_hat))]
     for i, grad in enumerate(torch.autograd.grad(loss(*inputs), inputs)):

@@ -26,9 +26,11 @@ from rich.table import Table
 from torch import Tensor
 
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior, read_calibration
+from geodiff_plugin.algorithm.member import Member
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.metrics import evaluate_depth
-from geodiff_plugin.result import output
+from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.result import finish
 from tests.lab.edges import surface_error
 
 __all__ = ["STAGES", "Flatness", "Stages", "draw_stages", "flatness", "guided_stages", "main"]
@@ -88,12 +90,12 @@ class Stages:
 @contextmanager
 def _observed() -> Iterator[Stages]:
     """Record the stages of the guided call, of one image and one member, that is made within."""
-    stages, finish, fit = Stages(), output._finish, output.fit_depth
+    stages, refine, fit = Stages(), finish.refine, finish.fit_depth
 
-    def finishing(run: Any, image: int, depth_m: Tensor, *more: Any) -> Any:
+    def refining(evidence: Evidence, members: Sequence[Member], depth_m: Tensor, *more: Any) -> Any:
         stages.loop = depth_m[0, 0].numpy().copy()
-        stages.take_matches(run.evidence[image].matches, tuple(depth_m.shape[-2:]))
-        return finish(run, image, depth_m, *more)
+        stages.take_matches(evidence.matches, tuple(depth_m.shape[-2:]))
+        return refine(evidence, members, depth_m, *more)
 
     def fitting(*arguments: Any) -> Any:
         fitted = fit(*arguments)
@@ -101,8 +103,8 @@ def _observed() -> Iterator[Stages]:
         return fitted
 
     with ExitStack() as patches:
-        patches.enter_context(patch.object(output, "_finish", finishing))
-        patches.enter_context(patch.object(output, "fit_depth", fitting))
+        patches.enter_context(patch.object(finish, "refine", refining))
+        patches.enter_context(patch.object(finish, "fit_depth", fitting))
         yield stages
 
 

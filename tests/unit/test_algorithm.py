@@ -6,17 +6,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin.algorithm import edges
 from geodiff_plugin.algorithm.correction import correction_target, fit_depth, off_edges
+from geodiff_plugin.algorithm.edges import sharpen_edges
 from geodiff_plugin.algorithm.gradients import RULES, Adam, FiniteWatch, pull_back
 from geodiff_plugin.algorithm.schedule import count_steps, make_schedule
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.rows import match_rows
-from geodiff_plugin.result import full_resolution
+from geodiff_plugin.result import voting
 from geodiff_plugin.result.confidence import MATCH_NOISE_PX, expected_error
-from geodiff_plugin.result.full_resolution import sharpen_edges, vote_depth
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.result.voting import vote_depth
+from geodiff_plugin.types import CameraView, PosedViews
 
 
 def schedule(steps, config=DEFAULT, **options):
@@ -244,7 +246,7 @@ def test_sharpening_gives_depths_that_are_there_whatever_the_strips(monkeypatch)
     whole = sharpen_edges(soft, left, 2)
     assert not torch.equal(whole, soft) and torch.isin(whole, soft).all()
     monkeypatch.setattr("geodiff_plugin.formats.depth.STRIP_PIXELS", 5 * 64)
-    monkeypatch.setattr(full_resolution, "STRIP", 7)
+    monkeypatch.setattr(edges, "STRIP", 7)
     assert torch.equal(sharpen_edges(soft, left, 2), whole)
 
 
@@ -274,7 +276,8 @@ def scene(side: int = 1, doffs: float = 0.0) -> tuple[Tensor, Tensor, CameraView
 
 def voted(map_m: Tensor, left: Tensor, views, matched_m: Tensor, confidence: float, error=0.4, *spacing):
     target = Matches(1.0 / matched_m, torch.full_like(matched_m, confidence), torch.full((1,), 2e-3))
-    return vote_depth(map_m, left, CAMERA, views, target, torch.full((1, 1, 1, 1), error), *spacing)
+    native = PosedViews(left[0], tuple(views), CAMERA)
+    return vote_depth(map_m, native, target, torch.full((1, 1, 1, 1), error), *spacing)
 
 
 @pytest.mark.parametrize(("side", "doffs"), [(1, 0.0), (-1, 0.0), (1, 4.0), (-1, 4.0)])
@@ -301,8 +304,8 @@ def test_a_weak_map_takes_its_edges_from_the_views_and_their_colours(monkeypatch
     turned = view._replace(T_right_from_left=view.T_right_from_left.roll(1, 0))
     for views in ([], [turned], [view._replace(image_01=view.image_01[..., 1:])]):  # none is rectified
         assert voted(moved, left, views, truth, 0.95) is moved
-    monkeypatch.setattr(full_resolution, "STRIP", 700)
-    monkeypatch.setattr(full_resolution, "MOST_PIXELS", 36 * 48)
+    monkeypatch.setattr(voting, "STRIP", 700)
+    monkeypatch.setattr(voting, "MOST_PIXELS", 36 * 48)
     large = voted(truth, left, [view], truth, 0.95)  # which takes its edges from its colours
     assert ((large < 3.5) != (truth < 3.5))[..., 12:-12].float().mean() < 0.02
 
@@ -317,8 +320,8 @@ def test_a_good_map_keeps_its_edges_only_if_they_are_crisp():
     for map_m in (followed, coarse):
         assert ((map_m / truth - 1.0).abs() > 0.1)[..., 12:-12].float().mean() < 0.01
     # A box filter of the log depth makes steps of as many pixels; a slope to the border is no step.
-    assert full_resolution._crispness(torch.linspace(0.0, 2.0, 96).exp().expand(72, 96)) == 1.0
+    assert voting._crispness(torch.linspace(0.0, 2.0, 96).exp().expand(72, 96)) == 1.0
     for pixels in (1, 2, 3, 5):
         blurred = F.avg_pool2d(F.pad(truth.log(), (pixels // 2,) * 4, mode="replicate"), pixels, 1).exp()
-        share = float(full_resolution._crispness(blurred[0, 0]))
+        share = float(voting._crispness(blurred[0, 0]))
         assert share == pytest.approx(min(1.0, 2.5 / pixels), rel=0.05)

@@ -26,7 +26,8 @@ from geodiff_plugin.jobs import capture as run
 from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.plotting import grid
 from geodiff_plugin.pose.capture import SolvedCapture, candidate_pairs, solve_capture
-from geodiff_plugin.result.verdict import Indicators, judge
+from geodiff_plugin.result.indicators import Indicators
+from geodiff_plugin.result.verdict import judge
 from tests.cli.conftest import call
 from tests.unit.capture_room import FLIP, HALF, SIZE, K, perturbed, render, walk, write_transforms
 

@@ -66,8 +66,8 @@ def test_fewer_matches_are_wrong(pair: SyntheticPair, flawed) -> None:
     view = CameraView(right, pair.K_right.float(), T)
     config = GuidanceConfig(pose="given")
     made = make_evidence(left, Inputs(pair.K_left.numpy(), (view,), (), None), config, False)
-    assert torch.equal(made.native_left, cleaned[0])
-    assert torch.equal(made.native_views[0].image_01, cleaned[1])
+    assert torch.equal(made.native.left_01, cleaned[0])
+    assert torch.equal(made.native.views[0].image_01, cleaned[1])
 
 
 def test_a_photograph_is_cleaned_before_it_is_undistorted(pair: SyntheticPair) -> None:

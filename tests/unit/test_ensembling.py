@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from geodiff_plugin.result.output import ensemble_metric, median
+from geodiff_plugin.result.ensemble import ensemble_metric, median
 
 
 @pytest.mark.parametrize(

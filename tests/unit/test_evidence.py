@@ -7,15 +7,16 @@ import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin.algorithm.terms import Objective
+from geodiff_plugin.algorithm.terms import Given, Objective
+from geodiff_plugin.algorithm.views import chunk_views
 from geodiff_plugin.config import GuidanceConfig
-from geodiff_plugin.evidence import prepare
-from geodiff_plugin.evidence.evidence import chunk_views, prepare_evidence
+from geodiff_plugin.evidence import store as evidence_store
 from geodiff_plugin.evidence.inputs import Inputs
-from geodiff_plugin.evidence.prepare import EvidenceStore
+from geodiff_plugin.evidence.prepare import prepare_evidence
+from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.geometry import warp_right_to_left
 from geodiff_plugin.scale.space import MetricMap
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PosedViews
 from tests.benchmarks.matching import textured_pair
 from tests.conftest import render_plane
 
@@ -36,10 +37,10 @@ def wide_pair(size_right, focal_right, at_m=0.1):
     right, _ = render_plane(K_right, E, size_right, NORMAL, OFFSET, 1)
     images = [torch.from_numpy(image).permute(2, 0, 1).float() / 255 for image in (left, right)]
     T = torch.from_numpy(np.linalg.inv(E)).float()
-    views = [CameraView(images[1], torch.from_numpy(K_right).float(), T)]
+    views = (CameraView(images[1], torch.from_numpy(K_right).float(), T),)
     config = GuidanceConfig().changed(sweep_pixels=96 * 640, search="one-number")
-    K_left = torch.from_numpy(K).float()
-    return prepare_evidence(images[0], views, K_left, None, config, needs_matches=False)
+    native = PosedViews(images[0], views, torch.from_numpy(K).float())
+    return prepare_evidence(native, None, config, needs_matches=False)
 
 
 @pytest.mark.parametrize(
@@ -48,13 +49,13 @@ def wide_pair(size_right, focal_right, at_m=0.1):
 def test_above_the_grid_the_truth_still_explains_the_left_image(size_right, focal_right):
     """Neither K may stay that of the image as given, nor the right image be finer than the left one."""
     views = chunk_views([wide_pair(size_right, focal_right)])
-    right = views.further[0]
+    right = views.views[0]
     assert views.size == right.image_01.shape[-2:] == (96, 640)
     _, depth_m = render_plane(views.K_left[0].double().numpy(), np.eye(4), views.size, NORMAL, OFFSET, 1)
     cameras, errors = (views.K_left, right.K, right.T_right_from_left), []
     for factor in (1.0, 1.05):
         depth = factor * torch.from_numpy(depth_m)[None, None]
-        warped = warp_right_to_left(right.image_01, depth, *cameras, rays=views.rays[0])
+        warped = warp_right_to_left(right.image_01, depth, *cameras)
         assert warped.visible.float().mean() > 0.8
         error = (warped.image - views.left_01).abs().mean(1, keepdim=True)
         errors.append(float(error[warped.visible].mean()))
@@ -69,7 +70,7 @@ def test_below_min_visible_the_photographs_have_no_say(min_visible):
     objective = Objective(views, metric, GuidanceConfig(**knobs, min_visible=min_visible))
     affine = metric.from_range(torch.tensor([1.0]), torch.tensor([1.4]))
     x = torch.full((1, 1, 96, 640), 0.3, requires_grad=True)
-    loss = objective(x, affine, affine, x, x, None)
+    loss = objective(x, Given(affine, affine, x, x))
     share = float(loss.visible_fraction)
     (gradient,) = torch.autograd.grad(loss.total.sum(), x)
     assert 0.5 < share < 0.7
@@ -84,7 +85,7 @@ SETTINGS = (GuidanceConfig(), True)
 def made(monkeypatch):
     """The calls that reach ``make_evidence``, answered by their number."""
     calls = []
-    monkeypatch.setattr(prepare, "make_evidence", lambda *given: calls.append(given) or len(calls))
+    monkeypatch.setattr(evidence_store, "make_evidence", lambda *given: calls.append(given) or len(calls))
     return calls
 
 

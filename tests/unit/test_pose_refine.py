@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,12 +11,13 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance
+from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
 from geodiff_plugin.pose.refine import fit_displacement, refine_views, straightened, undecided
 from geodiff_plugin.pose.solve import PosePrior, is_rig, settle_poses, solve_poses
 from geodiff_plugin.pose.tracks import Tracks, median_residuals, residuals_px, solve_inverse_depth
-from geodiff_plugin.result.verdict import read_indicators
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.result.indicators import read_indicators
+from geodiff_plugin.types import CameraView, PosedViews
 from tests.scenes import render_pair
 
 K = np.array([[500.0, 0, 255.5], [0, 500.0, 191.5], [0, 0, 1]])
@@ -239,12 +239,10 @@ def test_a_tracker_keeps_the_scene_and_a_measured_baseline_its_length(pair) -> N
     moved = np.log(np.linalg.norm(report.E[0][:3, 3]) / given_length)
     assert 0.2 < moved / np.log(length / given_length) < 1.2
     assert report.scale_spread > 0.05  # even where both lengths agree
-    left, rights, K = posed(pair, wrong)
-    seen = SimpleNamespace(
-        matches=None, points=None, pose=report, native_views=rights, native_left=left, warnings=()
-    )
-    assert read_indicators(seen, K).scale_spread == report.scale_spread
-    assert np.isnan(read_indicators(seen, K, has_unit=False).scale_spread)
+    native = PosedViews(*posed(pair, wrong))
+    seen = Evidence(native, grid=native, volume=None, matches=None, pose=report)
+    assert read_indicators(seen).scale_spread == report.scale_spread
+    assert np.isnan(read_indicators(seen, has_unit=False).scale_spread)
 
 
 def test_views_are_used_as_given_where_no_better_pose_is_near(pair) -> None:
@@ -280,15 +278,15 @@ def test_everything_downstream_sees_the_refined_pose(pair) -> None:
     left = pair.left.image_01.float()[None]
     (refined,) = GeometryGuidance(pair.right.image_01, Ks, wrong).prepare(left)
     (given,) = GeometryGuidance(pair.right.image_01, Ks, wrong, pose="given").prepare(left)
-    report, E = refined.pose, np.linalg.inv(refined.native_views[0][2].numpy())
+    report, E = refined.pose, np.linalg.inv(refined.native.views[0][2].numpy())
     assert report.status == "refined" and report.residual_px[0] < 0.3 < 1.0 < report.residual_px_given[0]
     assert "px off their epipolar lines" in report.warnings[0]
     assert angle_deg(report.E[0][:3, :3].T @ true[:3, :3]) < 0.2
     assert np.allclose(E, report.E[0], atol=1e-5) and np.allclose(report.E_given[0], wrong, atol=1e-6)
-    for T in (refined.views[0][2], refined.volume.rights[0][2]):
+    for T in (refined.grid.views[0][2], refined.volume.rights[0][2]):
         assert np.allclose(np.linalg.inv(T.numpy()), E, atol=1e-6)
     assert given.pose.status == "given"
-    assert np.allclose(np.linalg.inv(given.native_views[0][2].numpy()), wrong, atol=1e-5)
+    assert np.allclose(np.linalg.inv(given.native.views[0][2].numpy()), wrong, atol=1e-5)
 
 
 @pytest.mark.parametrize("seed", [pytest.param(2, marks=pytest.mark.slow), 6])

@@ -8,12 +8,12 @@ from geodiff_plugin import GeometryGuidance, geometry
 from geodiff_plugin._camera_checks import check_intrinsics, check_size_of
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evaluation.figures import render_cloud
-from geodiff_plugin.evidence.evidence import prepare_evidence
+from geodiff_plugin.evidence.prepare import prepare_evidence
 from geodiff_plugin.formats.clouds import write_ply
 from geodiff_plugin.matching import build_cost_volume, match_volume, points_to_matches
 from geodiff_plugin.matching.build import inverse_pose_preferred, pilot_volume, to_grid
 from geodiff_plugin.matching.sweep import sweep_planes
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PosedViews
 from tests.conftest import textured
 from tests.unit.test_geometry import points_of, tensor
 
@@ -53,14 +53,14 @@ def test_the_sweep_and_all_that_is_made_of_it():
         sweep_planes(left.mean(0, keepdim=True), grey, camera, planes),
     )
     config = GuidanceConfig().changed(sweep_pixels=36 * 48)
-    evidence = prepare_evidence(left, rights, camera, None, config, needs_matches=True)
+    evidence = prepare_evidence(PosedViews(left, tuple(rights), camera), None, config, needs_matches=True)
     for matches in (*(match_volume(v) for v in volumes), evidence.matches):
         reliable = matches.confidence > 0.5
         assert reliable.float().mean() > 0.3
         assert float((1 / matches.inverse_depth[reliable]).median()) == pytest.approx(2.0, rel=0.04)
     assert not inverse_pose_preferred(left, rights, camera)
     small = geometry.resize_intrinsics(tensor(K), SIZE, (36, 48))[0]
-    np.testing.assert_allclose(evidence.K_left, small, rtol=1e-6)
+    np.testing.assert_allclose(evidence.grid.K_left, small, rtol=1e-6)
 
 
 def test_points_and_clouds(tmp_path):

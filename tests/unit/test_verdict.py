@@ -12,10 +12,13 @@ from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.messages import Message
 from geodiff_plugin.result.confidence import depth_confidence
-from geodiff_plugin.result.verdict import Indicators, judge
+from geodiff_plugin.result.indicators import Indicators
+from geodiff_plugin.result.verdict import judge
 from tests.scenes import render_pair
 
-GOOD = Indicators(confidence=0.85, matched=0.8, order=0.8, spread=0.7, baseline_m=0.12, view_deg=60.0)
+GOOD = Indicators(
+    confidence=0.85, matched=0.8, rank_correlation=0.8, spread=0.7, baseline_m=0.12, view_deg=60.0
+)
 ROW = {"points": 448, "cover": 0.125}
 ONE_POINT = {"points": 1, "matched": math.nan, "confidence": math.nan}
 
@@ -30,8 +33,8 @@ def test_a_good_run_is_trusted_in_silence():
         {"epipolar_px": 1.5, "scale_spread": 0.09},
         {"scale_spread": 0.2, "points": 99},  # known depths give the scale
         {"on_edge": True},  # a street's sky
-        {"order": 0.0, "spread": 0.1},  # a scene that is nearly flat
-        {"order": 0.1, "matched": 0.95},  # a poor prior under good matches
+        {"rank_correlation": 0.0, "spread": 0.1},  # a scene that is nearly flat
+        {"rank_correlation": 0.1, "matched": 0.95},  # a poor prior under good matches
     ):
         assert judge(replace(GOOD, **signs)).trusted and not judge(replace(GOOD, **signs)).remarks
     assert judge(Indicators(points=99, cover=0.5)).trusted
@@ -42,7 +45,7 @@ def test_a_good_run_is_trusted_in_silence():
     ("signs", "words"),
     [
         ({"same": True, "matched": 1.0, "confidence": 1.0}, "same picture"),
-        ({"flat": True, "spread": 0.01, "order": 0.05}, "shifted copy"),
+        ({"flat": True, "spread": 0.01, "rank_correlation": 0.05}, "shifted copy"),
         (
             {
                 "inverse_fits": True,
@@ -50,8 +53,8 @@ def test_a_good_run_is_trusted_in_silence():
             },
             "swapped.*2 times",
         ),
-        ({"order": -0.57}, "swapped"),
-        ({"order": 0.05, "matched": 0.45}, "hardly agree"),
+        ({"rank_correlation": -0.57}, "swapped"),
+        ({"rank_correlation": 0.05, "matched": 0.45}, "hardly agree"),
         ({"confidence": 0.25}, "Likely causes"),
         ({"matched": 0.05}, "5 % of the left image is matched"),
         ({"confidence": 0.4, "matched": 0.25}, "Likely causes"),
@@ -62,13 +65,16 @@ def test_a_good_run_is_trusted_in_silence():
         ({"epipolar_px": 1.5, "confidence": 0.45}, "Likely causes"),
         (ONE_POINT, "Too few known depths to fix scale and shift: 1;"),
         (
-            {"points": 99, "cover": 1.0, "matched": math.nan, "order": 0.1},
+            {"points": 99, "cover": 1.0, "matched": math.nan, "rank_correlation": 0.1},
             "known depths disagree",
         ),
         ({"at_end": 0.26}, "26 % of the matches lie at an end"),
         ({"baseline_m": 0.00012}, "0.12 mm"),
         (
-            {"order": -0.9, "doubts": (Message("camera.principal-point", "K is for another image."),)},
+            {
+                "rank_correlation": -0.9,
+                "doubts": (Message("camera.principal-point", "K is for another image."),),
+            },
             "depth: K is for another image",
         ),
         ({"off_matches": 0.4}, "differs by 49 %"),

@@ -1,0 +1,39 @@
+"""Depth maps that a network which takes a prompt starts from, made of matches and points alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.algorithm.correction import fit_depth, prior_error
+from geodiff_plugin.config import GuidanceConfig
+from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.matching import Matches, with_points
+
+#: Longer side of the depth prompt, pixels: such networks were trained with maps of a phone's lidar.
+PROMPT_LONG_EDGE = 256
+
+
+def depth_prompt(evidence: Sequence[Evidence], config: GuidanceConfig) -> Tensor | None:
+    """``(N, 1, h, w)`` metres: flat maps corrected by matches and points; ``None`` if one image has none."""
+    maps = [_prompt_of(image, config) for image in evidence]
+    known = [depth_m for depth_m in maps if depth_m is not None]
+    return torch.cat(known) if len(known) == len(maps) else None
+
+
+def _prompt_of(evidence: Evidence, config: GuidanceConfig) -> Tensor | None:
+    """``(1, 1, h, w)`` metres of one image."""
+    confident, points = Matches.stack([evidence.reliable]), Matches.stack([evidence.points])
+    target = confident if points is None else with_points(confident, points)
+    if target is None:
+        return None
+    height, width = evidence.grid.size
+    factor = min(1.0, PROMPT_LONG_EDGE / max(height, width))
+    size = max(1, round(height * factor)), max(1, round(width * factor))
+    median = 1.0 / target.inverse_depth[target.confidence > 0].median()
+    flat, left = median.expand(1, 1, height, width), evidence.grid.left_01[None]
+    depth_m, _, _ = fit_depth(flat, target, left, prior_error(flat, target, left, config), config)
+    return F.interpolate(depth_m, size, mode="bilinear", antialias=True)

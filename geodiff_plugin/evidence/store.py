@@ -1,0 +1,61 @@
+"""``EvidenceStore``: evidence kept for further calls with the same images, cameras and settings."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from geodiff_plugin.config import GuidanceConfig
+from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.evidence.inputs import Inputs
+from geodiff_plugin.evidence.prepare import make_evidence
+
+
+class EvidenceStore:
+    """A cache of evidence by the values that it was made from; several guidances may share it."""
+
+    def __init__(self, size: int = 2, copies: bool = True) -> None:
+        """Keep the last ``size`` images, some 100 MB each; without ``copies`` they must not be changed."""
+        self._size, self._copies, self._spared = size, copies, 0.0
+        # Tensors and settings that an entry was made from, the entry, and the seconds that it took.
+        self._entries: list[tuple[list[Tensor | None], tuple[Any, ...], Evidence, float]] = []
+
+    def get(
+        self,
+        left_01: Tensor,
+        given: Inputs,
+        config: GuidanceConfig,
+        needs_matches: bool,
+        measured: bool = False,
+    ) -> Evidence:
+        """What ``make_evidence`` gives for these arguments; the caller must not change it."""
+        views = [value for view in given.views for value in view]
+        tensors = [left_01, torch.from_numpy(given.K_left), given.points, *views]
+        knobs = ("pose", "clean_photographs", "depth_range", "planes", "sweep_pixels")
+        settings = (*(getattr(config, name) for name in knobs), config.search == "volume")
+        settings = (*settings, needs_matches, measured, given.unit)
+        for held, made_with, evidence, seconds in self._entries:
+            if made_with == settings and len(held) == len(tensors) and all(map(_equal, held, tensors)):
+                self._spared += seconds
+                return evidence
+        start = time.perf_counter()
+        evidence = make_evidence(left_01, given, config, needs_matches, measured)
+        # Copies, so that an image that was changed in place since is not taken for the same.
+        held = [value.clone() if self._copies and value is not None else value for value in tensors]
+        self._entries.insert(0, (held, settings, evidence, time.perf_counter() - start))
+        del self._entries[self._size :]
+        return evidence
+
+    def take_spared_seconds(self) -> float:
+        """Seconds that the cache saved since the last call of this method; benchmarks add them."""
+        spared, self._spared = self._spared, 0.0
+        return spared
+
+
+def _equal(a: Tensor | None, b: Tensor | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return a.device == b.device and a.shape == b.shape and torch.equal(a, b)

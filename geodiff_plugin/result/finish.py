@@ -1,0 +1,257 @@
+"""Act 3 for one image: from the maps of its ensemble to depth at full size, confidence and verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImageProcessor
+from torch import Tensor
+
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.algorithm.correction import correction_target, fit_depth, local_error
+from geodiff_plugin.algorithm.edges import sharpen_edges
+from geodiff_plugin.algorithm.member import Member
+from geodiff_plugin.config import GuidanceConfig
+from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.geometry import image_size, resize_intrinsics
+from geodiff_plugin.matching import Matches, build_cost_volume, match_volume
+from geodiff_plugin.messages import Message
+from geodiff_plugin.result.confidence import depth_confidence, reprojection
+from geodiff_plugin.result.ensemble import median, spread_around
+from geodiff_plugin.result.indicators import Indicators, read_indicators
+from geodiff_plugin.result.verdict import Verdict, judge, points_agreement
+from geodiff_plugin.result.voting import vote_depth
+from geodiff_plugin.scale.points import order_agreement
+
+#: Least depth of a metric prior, metres: its nearest pixel may be 0.
+LEAST_M = 1e-6
+
+
+@dataclass(frozen=True)
+class ResultOptions:
+    """What a call asks of its results."""
+
+    config: GuidanceConfig
+    resampling: str = "bilinear"  # of the members of an ensemble, as the pipeline resizes its result
+    reduction: str = "median"  # of an ensemble, or ``"mean"``
+    has_unit: bool = True  # whether lengths are in metres
+    doubts: tuple[Message, ...] = ()  # warnings about the input, each of which forbids trust
+
+
+@dataclass(frozen=True, eq=False)
+class ImageResult:
+    """Everything that is known about the depth of one image; what does not apply is ``None``.
+
+    Maps are ``(1, 1, H, W)``, of the size of ``depth_m``; numbers of its ``E`` members are on the CPU.
+    """
+
+    evidence: Evidence
+    depth_m: Tensor  # metres
+    K: Tensor  # (3, 3) pixels of ``depth_m``
+    relative: Tensor  # the prior's map, about [0, 1]
+    scale: Tensor  # (E,)
+    shift: Tensor  # (E,)
+    global_scale: Tensor  # (E,) metres
+    verdict: Verdict
+    uncertainty: Tensor | None = None  # metres
+    visible: Tensor | None = None  # bool, whether a right view sees the pixel
+    photometric_error: Tensor | None = None  # [0, 1]
+    confidence: Tensor | None = None  # [0, 1]
+    support: Tensor | None = None  # [0, 1]
+    prior_error: Tensor | None = None  # (1, 1, 1, 1), or per pixel, log depth
+    over_prior: Tensor | None = None  # (E, h w) ratio of the depth to a metric prior's
+
+
+class Refined(NamedTuple):
+    """A map ``(1, 1, H, W)`` metres fitted to its matches and points, and how far these determine it."""
+
+    depth_m: Tensor
+    support: Tensor
+
+
+def finish(
+    evidence: Evidence,
+    members: Sequence[Member],
+    depth_m: Tensor,
+    uncertainty: Tensor | None,
+    options: ResultOptions,
+) -> ImageResult:
+    """The result of one image.
+
+    Args:
+        evidence: of the image, from act 1.
+        members: of its ensemble, from act 2.
+        depth_m: ``(1, 1, H, W)`` metres, the members reduced, at the image's or at the processing size; it is
+            changed in place.
+        uncertainty: ``(1, 1, H, W)`` metres, their spread; ``None`` where none is asked for.
+        options: what the call asks for.
+    """
+    native = evidence.native
+    depth_m = _within_range(depth_m.float().to(native.left_01.device), members)
+    size = image_size(depth_m)
+    left_01 = _resized(native.left_01[None], size)
+    K = resize_intrinsics(native.K_left[None], native.size, size)
+    refined = refine(evidence, members, depth_m, left_01, options.config) if options.config.crisp else None
+    support = None
+    if refined is not None:
+        depth_m, support = refined
+    if uncertainty is not None:
+        uncertainty = uncertainty.to(depth_m)
+        if support is not None:
+            uncertainty = _spread_of_members(evidence, members, depth_m, left_01, options)
+    visible, error = None, None
+    if native.views:
+        visible, error = reprojection(native.views, depth_m, left_01, K)
+    prior_error, confidence = _error_of(members), None
+    if support is not None:
+        nothing = torch.zeros_like(depth_m) if error is None else error
+        seen = (nothing, nothing > 0) if visible is None else (nothing, visible)
+        spread = None if uncertainty is None else uncertainty / depth_m
+        confidence = depth_confidence(support, *seen, spread, prior_error)
+    over_prior = _over_prior(members, depth_m)
+    relative = median(torch.cat([member.relative for member in members]), 0)[None]
+    measured = _Measured(depth_m, relative, confidence, over_prior)
+    verdict = judge(_indicators(evidence, members, measured, options))
+    if confidence is not None:
+        confidence = confidence * points_agreement(verdict.indicators)
+    return ImageResult(
+        evidence=evidence,
+        depth_m=depth_m,
+        K=K[0],
+        relative=_resized(relative, size, antialias=False),
+        scale=torch.cat([member.affine.scale for member in members]).cpu(),
+        shift=torch.cat([member.affine.shift for member in members]).cpu(),
+        global_scale=torch.cat([member.affine.g_s for member in members]).cpu(),
+        verdict=verdict,
+        uncertainty=uncertainty,
+        visible=visible,
+        photometric_error=error,
+        confidence=confidence,
+        support=support,
+        prior_error=prior_error,
+        over_prior=over_prior,
+    )
+
+
+def _resized(x: Tensor, size: tuple[int, int], antialias: bool = True) -> Tensor:
+    if image_size(x) == size:
+        return x
+    return F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=antialias)
+
+
+def _within_range(depth_m: Tensor, members: Sequence[Member]) -> Tensor:
+    """A map clamped, in place, to the range of the members that it was made of: resizing may overshoot."""
+    near_m, far_m = (torch.cat([getattr(m, name) for m in members]) for name in ("near_m", "far_m"))
+    return depth_m.clamp_(near_m.to(depth_m).amin(0, keepdim=True), far_m.to(depth_m).amax(0, keepdim=True))
+
+
+def _mean(members: Sequence[Member], name: str) -> Tensor | None:
+    """Mean of what was measured of each member, ``(1, 1, h, w)``; ``None`` where nothing was."""
+    values = [value for member in members if (value := getattr(member, name)) is not None]
+    return torch.cat(values).float().mean(0, keepdim=True) if values else None
+
+
+def _error_of(members: Sequence[Member]) -> Tensor | None:
+    """Error of the prior in log depth, ``local_error`` of the members' mean."""
+    return local_error(_mean(members, "error"), _mean(members, "valid"))
+
+
+def refine(
+    evidence: Evidence, members: Sequence[Member], depth_m: Tensor, left_01: Tensor, config: GuidanceConfig
+) -> Refined | None:
+    """Sharpen the edges of a map of these members, fit it to its matches, and let these vote.
+
+    Edges are sharpened first: then the fit does not carry the depth of one surface over to the next.
+    ``left_01 (1, 3, H, W)`` has the size of the map. ``None`` if there are neither matches nor points.
+    """
+    matches, points = Matches.stack([evidence.matches]), Matches.stack([evidence.points])
+    if matches is None and points is None:
+        return None
+    weight, error = _mean(members, "reflection_weight"), _error_of(members)
+    spacing = max(image_size(depth_m)) / max(image_size(members[0].relative))
+    depth_m = sharpen_edges(depth_m, left_01, max(1, round(spacing)))
+    target = correction_target(matches, points, weight, error, depth_m)
+    if target is None or error is None:
+        return None
+    fitted_m, support, _ = fit_depth(depth_m, target, evidence.native.left_01[None], error, config)
+    if matches is not None:
+        target = correction_target(matches, points, weight, error, fitted_m)
+        assert target is not None  # there are matches
+        measured = error.amin((2, 3), keepdim=True)  # its value where the prior gives a depth
+        fitted_m = vote_depth(fitted_m, evidence.native, target, measured, spacing)
+    return Refined(fitted_m, support)
+
+
+def _spread_of_members(
+    evidence: Evidence, members: Sequence[Member], depth_m: Tensor, left_01: Tensor, options: ResultOptions
+) -> Tensor:
+    """Spread of the members, each refined like ``depth_m``, around it, ``(1, 1, H, W)`` metres."""
+    size, refined_m = image_size(depth_m), []
+    for member in members:
+        member_m = member.depth_m.to(depth_m)
+        if image_size(member_m) != size:  # resized as the stock call resizes the ensemble
+            resize = MarigoldImageProcessor.resize_antialias
+            member_m = _within_range(resize(member_m, size, options.resampling, is_aa=False), [member])
+        refined = refine(evidence, [member], member_m, left_01, options.config)
+        assert refined is not None  # as the map of all members
+        refined_m.append(refined.depth_m)
+    return spread_around(depth_m, torch.cat(refined_m), options.reduction)
+
+
+def _over_prior(members: Sequence[Member], depth_m: Tensor) -> Tensor | None:
+    """``(E, h w)`` ratio of a map to a metric prior's own depth, on the prior's grid."""
+    priors_m = [member.prior_depth_m for member in members if member.prior_depth_m is not None]
+    if len(priors_m) < len(members):
+        return None
+    resized = F.interpolate(depth_m, priors_m[0].shape[-2:], mode="bilinear", align_corners=False)
+    return (resized / torch.cat(priors_m).clamp_min(LEAST_M)).flatten(1)
+
+
+class _Measured(NamedTuple):
+    """Maps of one image that its indicators are read from."""
+
+    depth_m: Tensor
+    relative: Tensor
+    confidence: Tensor | None
+    over_prior: Tensor | None
+
+
+def _indicators(
+    evidence: Evidence, members: Sequence[Member], measured: _Measured, options: ResultOptions
+) -> Indicators:
+    """Indicators of one image; if its run used no matches, they are made here for the verdict."""
+    correlations = [m.rank_correlation for m in members if m.rank_correlation is not None]
+    correlation = torch.cat(correlations).nanmean()
+    if evidence.matches is None and evidence.native.views:
+        with suppress(InputError):  # views without overlap: not judged
+            matches = _matched(evidence, options.config)
+            evidence = replace(evidence, matches=matches, points=None)
+            correlation = order_agreement(measured.relative, matches, members[0].metric.space)
+    further: dict[str, float] = {}
+    if measured.confidence is not None:
+        further["confidence"] = float(measured.confidence.mean())
+    if measured.over_prior is not None and options.has_unit:
+        further["prior_ratio"] = float(measured.over_prior.median())
+    return read_indicators(
+        evidence,
+        measured.depth_m[0],
+        range_given=options.config.depth_range is not None,
+        has_unit=options.has_unit,
+        rank_correlation=float(correlation),
+        on_edge=any(m.on_edge is not None and bool(m.on_edge) for m in members),
+        doubts=options.doubts,
+        **further,
+    )
+
+
+def _matched(evidence: Evidence, config: GuidanceConfig) -> Matches:
+    """Matches of an image whose configuration asks for none."""
+    volume = evidence.volume
+    if volume is None:
+        volume = build_cost_volume(*evidence.native, depth_range=config.depth_range, config=config)
+    return match_volume(volume)

@@ -1,0 +1,251 @@
+"""Place the depth edges of the result by a vote of prior, matches and colours of the image.
+
+Beyond the paper, whose result is the decoded latent: the matches around every pixel vote on its depth.
+Weighted medians after Ma et al., Constant Time Weighted Median Filtering for Stereo Matching and Beyond, ICCV
+2013; large pictures after Kopf et al., Joint Bilateral Upsampling, SIGGRAPH 2007.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from geodiff_plugin.algorithm.correction import highest
+from geodiff_plugin.algorithm.edges import HALF, REACH, STRIP
+from geodiff_plugin.geometry import image_size, is_rectified, resize_image
+from geodiff_plugin.matching import Matches
+from geodiff_plugin.matching.rows import match_rows
+from geodiff_plugin.types import CameraView, PosedViews
+
+#: Difference in brightness at which a neighbour's weight falls to a third.
+BRIGHTNESS = 0.1
+#: Upper bound on the pixels of the voting grid; larger pictures upsample its depth, guided by colour.
+MOST_PIXELS = 600_000
+#: Offsets of the voters in samples: every second one of the window, which is as good as all of them.
+WINDOW = [(v, u) for v in range(-HALF, HALF + 1) for u in range(-HALF, HALF + 1) if (v + u) % 2 == 0]
+#: Pixels between samples of the window: it has to reach beyond the ragged border of a sweep's match.
+SPACING = 4
+#: Weight of a row match relative to a sure match of the sweep: it places edges on a finer grid.
+ROWS = 1.5
+#: The same of a gap filled from the farther surface, which is a guess.
+FILLED = 0.5
+#: Error of a prior from which its map has the least vote.
+WEAK_PRIOR = 0.2
+#: That vote, as a share of a window full of sure matches. It grows as the cube of a smaller error: a good
+#: prior knows where edges are.
+MAP_VOTE = 0.03
+#: A match that differs from the map by this many errors of the prior counts for a quarter.
+DIFFERS = 2.0
+#: The largest error of a prior that is used for this: a useless map would let every wrong match vote.
+ERROR_OF_VOTES = 0.1
+#: Reach in which a step of the map is looked for, pixels.
+NEARBY = 4
+#: Reach beyond which the step must not go on, pixels: it would be the slope of a wide surface.
+WIDE = 12
+#: The least step in log depth.
+EDGE = 0.1
+#: How much larger the step may be within the wider reach.
+RISE = 2.2
+#: Pixels that a crisp step takes.
+STEP_PX = 2
+#: The share of a crisp step within them: a decoded map never reaches 1.
+CRISP = 0.8
+#: The least share that is told apart from a slope.
+LEAST_CRISP = 0.1
+#: Power with which a soft map raises the error of its prior at edges.
+SOFT = 4.0
+#: Up to which error: the matches of a soft map are no better for it.
+MOST_SOFT = 0.14
+#: Votes within about this many pixels of the median make the mean.
+NEAR_PX = 1.0
+#: Side of the last median filter, pixels of the voting grid.
+MEDIAN = 5
+
+
+class _Votes(NamedTuple):
+    """One vote per pixel of the grid, ``(h, w)`` pixels of shift, and its weight, ``(h, w)`` >= 0."""
+
+    shift: Tensor
+    weight: Tensor
+
+
+@torch.no_grad()
+def vote_depth(
+    depth_m: Tensor, native: PosedViews, target: Matches, error: Tensor, spacing: float = 1.0
+) -> Tensor:
+    """Give every pixel the depth voted by the map and by the matches around it that have its colour.
+
+    With ``d = f b / depth`` the shift between the views in pixels, ``d_i`` the votes in a pixel's window and
+    ``w_i`` their weights, the surface is the weighted median ``m = argmin_d sum_i w_i |d_i - d|``. The result
+    is the mean of the votes near it, ``sum_i v_i d_i / sum_i v_i``, ``v_i = w_i / (1 + (d_i - m)^2 /
+    NEAR_PX^2)^2``. The map votes for its own ``d_0`` with a fixed weight, and a match of confidence ``c`` at
+    the distance ``r`` in samples with ``w = c exp(-r^2 / (2 REACH^2)) exp(-|I - I_i| / BRIGHTNESS) /
+    (1 + (log d_i / d_0)^2 / (DIFFERS s)^2)^2``: less with another colour ``I``, and less the more standard
+    deviations ``s``, of match and map together, it differs from the map.
+
+    Rows of a rectified view are matched again at this resolution, for edges that the sweep's grid cannot
+    resolve; without such a view of the left image's size the map is returned unchanged.
+
+    Args:
+        depth_m: ``(1, 1, H, W)`` metres, fitted to the matches.
+        native: the image and its right views at their own sizes.
+        target: matches and known points, on any grid.
+        error: ``(1, 1, 1, 1)`` of the prior in log depth: how much contradicting matches, and the map, count.
+        spacing: pixels of the map per pixel of the grid that it was decoded on.
+
+    Returns:
+        As ``depth_m``, within its range.
+    """
+    rectified = [v for v in native.views if is_rectified(native.K_left, v.K, v.T_right_from_left)]
+    view = next((v for v in rectified if image_size(v.image_01) == native.size), None)
+    if view is None:
+        return depth_m
+    full = image_size(depth_m)
+    share = min(1.0, math.sqrt(MOST_PIXELS / (full[0] * full[1])))
+    size = max(1, round(full[0] * share)), max(1, round(full[1] * share))
+    left, K = _resized(native.left_01, native.K_left, size)
+    right = CameraView(*_resized(view.image_01, view.K, size), view.T_right_from_left)
+    # Nearest: a mean across an edge is the depth of neither surface.
+    small_m, inverse_depth, confidence = (
+        F.interpolate(each.float(), size, mode="nearest-exact")[0, 0]
+        for each in (depth_m, target.inverse_depth, target.confidence)
+    )
+    px = (K[0, 0] * view.T_right_from_left[0, 3]).abs()  # shift of a depth of 1 m
+    shift, matched_px = px / small_m, px * inverse_depth
+    error = _error_at_edges(error, small_m, share * spacing)
+    nearest = torch.maximum(inverse_depth.amax(), 1.0 / small_m.amin()) * px
+    of_rows, matched, filled = match_rows(left, right, K, float(nearest))
+    voters = (
+        _weighed(_Votes(of_rows, ROWS * matched + FILLED * filled), shift, error),
+        _weighed(_Votes(matched_px, confidence.clamp(0.0, 1.0)), shift, error),  # a known point's is a count
+    )
+    map_vote = MAP_VOTE * (WEAK_PRIOR / error).clamp_min(1.0) ** 3
+    voted = _vote_in_windows(voters, left, shift, map_vote)
+    # The median smooths ragged borders; a map that outvotes its matches has none, and known points stay.
+    voted = torch.where((map_vote < 1.0) & (confidence <= 1.0), _median_filtered(voted), voted)
+    if size != full:
+        voted = _enlarged(voted, left, _resized(native.left_01, native.K_left, full)[0])
+    out_m = (px / voted.clamp_min(1e-6))[None, None].clamp(depth_m.amin(), depth_m.amax())
+    return out_m.to(depth_m.dtype)
+
+
+def _resized(image_01: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    return resize_image(image_01.float(), K.float(), size)
+
+
+def _median_filtered(values: Tensor) -> Tensor:
+    """A map ``(H, W)``, each pixel the median of ``MEDIAN`` times ``MEDIAN`` pixels around it."""
+    filtered = cv2.medianBlur(np.ascontiguousarray(values.cpu().numpy()), MEDIAN)
+    return torch.from_numpy(filtered).to(values.device)
+
+
+def _error_at_edges(error: Tensor, depth_m: Tensor, spacing: float) -> Tensor:
+    """``()`` the prior's error, larger for a map ``(H, W)`` with soft edges; ``spacing`` of its pixels."""
+    error = error.flatten()[0].clamp_min(1e-3)
+    crispness = _crispness(depth_m) / max(1.0, spacing / STEP_PX)  # a coarse grid places no edge well
+    return torch.maximum(error, (error / crispness**SOFT).clamp_max(MOST_SOFT))
+
+
+def _crispness(depth_m: Tensor) -> Tensor:
+    """``()`` in (0, 1]: the share of a step in a map ``(H, W)`` that ``STEP_PX`` pixels take; 1 is crisp.
+
+    The median over edges: pixels inside with a step nearby that is not the slope of a wide surface.
+    """
+    log_depth = depth_m.clamp_min(1e-9).log()[None, None]
+    across, down = ((log_depth - log_depth.roll(STEP_PX, axis)).abs() for axis in (-1, -2))
+    near, wide = (highest(log_depth, reach) + highest(-log_depth, reach) for reach in (NEARBY, WIDE))
+    at_edge = (near > EDGE) & (wide < RISE * near)
+    step = highest(torch.maximum(across, down), NEARBY)
+    share = torch.where(at_edge, step / near, torch.nan)[..., WIDE:-WIDE, WIDE:-WIDE]
+    return (share.flatten().nanmedian().nan_to_num(1.0) / CRISP).clamp(LEAST_CRISP, 1.0)
+
+
+def _weighed(votes: _Votes, shift: Tensor, error: Tensor) -> _Votes:
+    """Votes with a lower weight where they differ from the map's ``shift (H, W)`` by more than the error."""
+    noise = error.clamp_max(ERROR_OF_VOTES) ** 2 + 1.0 / shift**2  # of the map, and of a match (1 px)
+    apart = (votes.shift.clamp_min(0.1) / shift).log() ** 2 / (DIFFERS**2 * noise)
+    return votes._replace(weight=votes.weight / (1.0 + apart) ** 2)
+
+
+def weighted_median(values: Tensor, weight: Tensor, rounds: int = 7) -> Tensor:
+    """Weighted median over the first axis, to within ``2**-rounds`` of the values' range, by bisection.
+
+    Where all weights are 0, about the least value.
+    """
+    low, high, half = values.amin(0), values.amax(0), weight.sum(0) / 2.0
+    counted = torch.empty_like(weight)
+    for _ in range(rounds):
+        middle = 0.5 * (low + high)
+        torch.le(values, middle, out=counted)  # in place, ten times as fast as torch.where
+        reached = counted.mul_(weight).sum(0) >= half
+        high, low = torch.where(reached, middle, high), torch.where(reached, low, middle)
+    return 0.5 * (low + high)
+
+
+def _vote_in_windows(voters: Sequence[_Votes], left: Tensor, shift: Tensor, map_vote: Tensor) -> Tensor:
+    """``(H, W)`` the mean of the votes near their weighted median, strip by strip.
+
+    ``map_vote`` is the weight of the map's ``shift (H, W)`` as a share of a window full of sure matches;
+    neighbours of another colour in ``left (3, H, W)`` count for less.
+    """
+    height, width = shift.shape
+    halo = HALF * SPACING
+    padded = [
+        F.pad(each.view(1, -1, height, width), (halo,) * 4, mode="replicate")[0]
+        for each in (*(values for pair in voters for values in pair), left)
+    ]
+    closeness = [math.exp(-(v**2 + u**2) / (2.0 * REACH**2)) for v, u in WINDOW]
+    out = torch.empty_like(shift)
+    count = max(1, STRIP // width)
+    for first in range(0, height, count):
+        rows = slice(first, min(height, first + count))
+        around = [
+            [each[:, rows.start + v : rows.stop + v, u : u + width] for each in padded]
+            for v, u in ((halo + SPACING * v, halo + SPACING * u) for v, u in WINDOW)
+        ]
+        unlike = torch.stack([colours for *_, colours in around]).sub_(left[:, rows]).abs_().mean(1)
+        alike = unlike.div_(-BRIGHTNESS).exp_() * shift.new_tensor(closeness)[:, None, None]
+        votes, weights = [shift[rows][None]], [(map_vote * sum(closeness)).expand_as(shift[rows])[None]]
+        for k in range(len(voters)):
+            votes.append(torch.cat([each[2 * k] for each in around]))
+            weights.append(torch.cat([each[2 * k + 1] for each in around]).mul_(alike))
+        out[rows] = _mean_near_median(torch.cat(votes), torch.cat(weights))
+    return out
+
+
+def _mean_near_median(votes: Tensor, weights: Tensor) -> Tensor:
+    """``(...)`` the mean of votes ``(n, ...)`` within about ``NEAR_PX`` of their weighted median."""
+    median = weighted_median(votes, weights)
+    votes = votes - median
+    weights = weights / (1.0 + (votes / NEAR_PX) ** 2) ** 2
+    return median + (weights * votes).sum(0) / weights.sum(0).clamp_min(1e-9)
+
+
+def _enlarged(voted: Tensor, left: Tensor, whole: Tensor) -> Tensor:
+    """``(H, W)`` votes at the size of ``whole (3, H, W)``, from the 9 nearest ones of similar colour."""
+    (height, width), (rows, columns) = image_size(whole), image_size(left)
+    out = voted.new_empty(height, width)
+    x = (torch.arange(width, device=voted.device, dtype=voted.dtype) + 0.5) * (columns / width) - 0.5
+    count = max(1, STRIP // width)
+    for first in range(0, height, count):
+        part = slice(first, min(height, first + count))
+        y = torch.arange(part.start, part.stop, device=voted.device, dtype=voted.dtype) + 0.5
+        y = y * (rows / height) - 0.5
+        votes, weights = [], []
+        for down in (-1, 0, 1):
+            for right in (-1, 0, 1):
+                v, u = y.round() + down, x.round() + right
+                row, column = v.long().clamp(0, rows - 1)[:, None], u.long().clamp(0, columns - 1)
+                unlike = (left[:, row, column] - whole[:, part]).abs().mean(0) / BRIGHTNESS
+                away = (v - y)[:, None] ** 2 + (u - x) ** 2
+                votes.append(voted[row, column])
+                weights.append(torch.exp(-unlike - 2.0 * away))
+        out[part] = _mean_near_median(torch.stack(votes), torch.stack(weights))
+    return out
