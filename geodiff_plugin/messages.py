@@ -89,6 +89,7 @@ GROUPS = {
     "depth": "The depth",
     "prior": "The prior",
     "capture": "Captures",
+    "pairs": "Many pairs",
     "config": "Configurations",
     "verdict": "The verdict",
 }
@@ -487,6 +488,17 @@ MESSAGES: dict[str, MessageKind] = {
         "The video was not written",
         cause="OpenCV has no codec for it here.",
         cure="Nothing: everything else is written. Install an OpenCV with codecs for the video.",
+    ),
+    "pairs.in-order": MessageKind(
+        "Images of two folders are paired in order",
+        cause="The folders share no file name.",
+        cure="Check the first and the last pair that the message names. If they are wrong, give both images "
+        "of a pair one name.",
+    ),
+    "pairs.side-by-side": MessageKind(
+        "The video is taken to hold both views side by side",
+        cause="One video was given.",
+        cure="Give both videos if it holds the left view alone.",
     ),
     "config.former-knobs": MessageKind(
         "Knobs of a former version are left out",

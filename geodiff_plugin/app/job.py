@@ -157,5 +157,5 @@ def run_job(
 
         run = run_pair(pipe, options, inputs, log, callback_on_step_end=show)
         stage(0.95, "Drawing")
-        log.warnings += [sentence for sentence in run.output.assumed if sentence not in log.warnings]
+        log.add(run.output.assumed)
         return write_pair(folder, run)

@@ -91,11 +91,16 @@ def banner(status: str, more: str = "") -> str:
     return _box(f"verdict {status.replace(' ', '-')}", role, f"<b>{status.capitalize()}</b>{more}")
 
 
-def finished(status: str, figures: Sequence[tuple[str, str]], sentences: Sequence[str], cameras: str) -> str:
-    """The banner with numbers, sentences and the cameras; of what is not trusted the sentences first."""
+def finished(
+    status: str, figures: Sequence[tuple[str, str]], messages: Sequence[tuple[str, str]], cameras: str
+) -> str:
+    """The banner with numbers, messages and the cameras; of what is not trusted the messages first.
+
+    ``messages`` are codes (``geodiff_plugin.messages``) and sentences; the code is an attribute for scripts.
+    """
     escaped = [(html.escape(value), html.escape(name)) for value, name in figures]
     cells = "".join(f"<div><b>{value}</b><span>{name}</span></div>" for value, name in escaped)
-    items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in sentences)
+    items = "".join(f'<li data-code="{code}">{html.escape(sentence)}</li>' for code, sentence in messages)
     numbers, notes = f'<div class="figures">{cells}</div>', f"<ul>{items}</ul>" if items else ""
     body = numbers + notes if status == "trusted" else notes + numbers
     return banner(status, f'{body}<div class="cameras">{html.escape(cameras)}</div>')

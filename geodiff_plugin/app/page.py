@@ -27,6 +27,7 @@ from geodiff_plugin.app.job import Priors, Stopped, run_job
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.records import PairResult
 from geodiff_plugin.jobs.report import depth_summary
+from geodiff_plugin.messages import distinct
 
 #: A visitor's uploads, result and files are deleted after this long, and when the tab is closed.
 FORGET_AFTER_S = 600
@@ -136,8 +137,9 @@ def _cameras(job: PairResult) -> str:
 def _everything(panels: SimpleNamespace, job: PairResult, opened: str) -> dict[Any, Any]:
     """Every panel's value for a new result; the cloud's only while its tab is open."""
     verdict = job.run.output.verdict
-    sentences = dict.fromkeys([*verdict.reasons, *job.run.log.warnings])
-    told = [for_visitors(sentence) for sentence in sentences if sentence != verdict.sentence]
+    of_verdict = verdict.message and verdict.message.code  # which only sums up the others
+    messages = distinct(verdict.reasons, job.run.log.warnings)
+    told = [(m.code, for_visitors(m)) for m in messages if m.code != of_verdict]
     marked, words = results.measurement(job, [])
     sure = results.picture(job, "confidence")
     shown = {

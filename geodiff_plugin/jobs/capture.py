@@ -28,10 +28,11 @@ from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
 from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, check_new, write_text
 from geodiff_plugin.jobs.options import OF_SCALE, CaptureOptions
 from geodiff_plugin.jobs.prior import load_guided_prior
-from geodiff_plugin.jobs.report import plain, single_map, verdict_report
+from geodiff_plugin.jobs.report import messages_of, plain, single_map, verdict_report
 from geodiff_plugin.jobs.runner import BROKEN, Item, Journal, Runner, fingerprint, this_process
 from geodiff_plugin.jobs.telling import Tell, collected_warnings, say, silent
 from geodiff_plugin.jobs.writing import write_maps
+from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.pose.capture import SolvedCapture
 from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.types import MetricDepthOutput
@@ -87,8 +88,9 @@ def _save_solved(path: Path, solved: SolvedCapture, key: str) -> None:
     arrays["E_given"] = np.zeros(0) if solved.E_given is None else solved.E_given
     arrays["px"], arrays["point"] = map(np.concatenate, zip(*solved.seen, strict=True))
     arrays["counts"] = np.array([len(points) for _, points in solved.seen])
+    arrays["notes"] = np.array([(note.code, note) for note in solved.notes], np.str_).reshape(-1, 2)
     with atomic_path(path) as temporary:
-        np.savez_compressed(temporary, key=np.array(key), notes=np.array(solved.notes, np.str_), **arrays)
+        np.savez_compressed(temporary, key=np.array(key), **arrays)
 
 
 def load_solved(path: Path, key: str) -> SolvedCapture | None:
@@ -102,7 +104,7 @@ def load_solved(path: Path, key: str) -> SolvedCapture | None:
         px, point = np.split(arrays.pop("px"), cuts), np.split(arrays.pop("point"), cuts)
         values: dict[str, Any] = {n: a.item() if a.ndim == 0 else a for n, a in arrays.items()}
         values["E_given"] = values["E_given"] if values["E_given"].size else None
-        values["notes"] = tuple(map(str, values["notes"]))
+        values["notes"] = tuple(Message(str(code), str(text)) for code, text in values["notes"])
         return SolvedCapture(seen=tuple(zip(px, point, strict=True)), **values)
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -187,6 +189,7 @@ def _write_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[],
         "poses": [pose.status for pose in output.poses],
         "verdict": verdict_report(output),
         "warnings": list(output.warnings),
+        "messages": messages_of(output),
     }
 
     def fill(folder: Path) -> None:
@@ -301,6 +304,7 @@ def depth_capture(options: CaptureOptions, *, tell: Tell = silent, progress: boo
         "files": files,
         "agreement": agreement,
         "notes": capture.notes,
+        "messages": as_records(capture.notes, solved.notes),
         "failed": failed,
         "not_trusted": doubted,
         "frames": frames,

@@ -221,6 +221,7 @@ def _row(report: dict[str, Any]) -> Row:
         "seconds": round(sum(report["seconds"].values()), 3),
         "message": " ".join(report["warnings"]) or None,
         "reasons": " ".join(verdict["reasons"]),
+        "codes": " ".join(message["code"] for message in report.get("messages", ())) or None,
     }
 
 
@@ -313,7 +314,8 @@ def _final(record: Row, there: Row | None, options: DepthOptions, tell: Tell) ->
     assert options.out is not None
     reason = f"The depth in {options.out / record['key']} is {record['verdict']}: {record['reasons']}"
     tell(f"geodiff: {record['key']}: {reason}")  # --strict: it has failed
-    return dict.fromkeys(COLUMNS) | {"pair": record["key"], "result": "failed", "message": reason}
+    told = {"pair": record["key"], "result": "failed", "message": reason, "codes": record.get("codes")}
+    return dict.fromkeys(COLUMNS) | told
 
 
 def _write_table(out: Path, rows: Sequence[Row], tell: Tell) -> None:

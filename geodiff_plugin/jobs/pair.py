@@ -50,8 +50,8 @@ def run_pair(
     try:
         with log.stage("guided call"):
             output = pipe(inputs.left, guidance=inputs.guidance, strict=options.strict, **call)
-            for sentence in output.warnings:
-                warn(sentence)
+            for message in output.warnings:
+                warn(message)
     finally:
         pipe.set_progress_bar_config(disable=True)
     prior = {

@@ -16,10 +16,15 @@ from geodiff_plugin.formats.out import check_out
 from geodiff_plugin.formats.recordings import VIDEOS, is_bag, is_video, list_pairs, video_facts
 from geodiff_plugin.jobs.options import DepthOptions, check_files, told_apart
 from geodiff_plugin.jobs.telling import Tell, silent
+from geodiff_plugin.messages import Message
 
-#: The table of a run, and its columns.
+#: The table of a run, its columns, and how it begins, in all versions.
 SUMMARY = "pairs.csv"
-COLUMNS = ("pair", "result", "near_m", "median_m", "far_m", "verdict", "confidence", "seconds", "message")
+COLUMNS = (
+    *("pair", "result", "near_m", "median_m", "far_m", "verdict", "confidence", "seconds", "message"),
+    "codes",
+)
+BEGINNING = b"pair,result,near_m,"
 LISTS = (".csv", ".tsv", ".txt")
 
 
@@ -64,7 +69,7 @@ def start_many(options: DepthOptions, tell: Tell = silent) -> list[PairRef]:
     check_files(replace(options, prior_map=each[0].prior_map), photographs=False)
     assert options.out is not None
     path = check_out(options.out) / SUMMARY
-    ours = path.is_file() and path.read_bytes().startswith(",".join(COLUMNS).encode())
+    ours = path.is_file() and path.read_bytes().startswith(BEGINNING)
     if os.path.lexists(path) and not ours:
         cure = f"Name another --out, or move that {SUMMARY}: a table of the results takes its place."
         got = f"{options.out / SUMMARY}, which is not the table of an earlier run"
@@ -80,7 +85,7 @@ def find_pairs(options: DepthOptions, tell: Tell = silent) -> list[PairRef]:
     if not os.path.isdir(left) and not is_video(left):
         return _of_list(left, right)
     refs, assumed = (_of_folders if os.path.isdir(left) else _of_videos)(left, right)
-    if assumed:
+    if assumed is not None:
         tell(f"assumed: {assumed}")
     return refs
 
@@ -106,7 +111,7 @@ def _photographs(folder: Path) -> list[Path]:
     return sorted((path for path in paths if path.suffix.lower() in Image.EXTENSION), key=natural_order)
 
 
-def _of_folders(left: Path, right: Path | None) -> tuple[list[PairRef], str]:
+def _of_folders(left: Path, right: Path | None) -> tuple[list[PairRef], Message | None]:
     """The pairs, and what was assumed of them."""
     if right is None or not os.path.isdir(right):
         got = "nothing" if right is None else right
@@ -123,25 +128,26 @@ def _of_folders(left: Path, right: Path | None) -> tuple[list[PairRef], str]:
     if not {path.stem for path in lefts} & set(of_stem) and len(lefts) == len(rights):
         pairs = list(zip(lefts, rights, strict=True))  # im0_L.png, im0_R.png
         first, last = (f"{a.name} with {b.name}" for a, b in (pairs[0], pairs[-1]))
-        assumed = f"The two folders share no name, so images are paired in order: {first} to {last}."
-        return [PairRef(a.stem, a, b) for a, b in pairs], assumed
+        sentence = f"The two folders share no name, so images are paired in order: {first} to {last}."
+        return [PairRef(a.stem, a, b) for a, b in pairs], Message("pairs.in-order", sentence)
     if alone := {path.stem for path in lefts} ^ set(of_stem):
         cure = "Remove it, or write a list of pairs: LEFT,RIGHT[,CALIB] a line."
         got = f"{len(lefts)} left and {len(rights)} right images; {min(alone)} has no partner"
         bad_value("LEFT and RIGHT", "folders of images with the same names, or as many in order", got, cure)
-    return [PairRef(path.stem, path, of_stem[path.stem]) for path in lefts], ""
+    return [PairRef(path.stem, path, of_stem[path.stem]) for path in lefts], None
 
 
-def _of_videos(left: Path, right: Path | None) -> tuple[list[PairRef], str]:
+def _of_videos(left: Path, right: Path | None) -> tuple[list[PairRef], Message | None]:
     frames = video_facts(left, "LEFT")[0]
     if right is None:
-        return _frames(frames, left, None), f"{left} holds both views side by side; else name both videos."
+        sentence = f"{left} holds both views side by side; else name both videos."
+        return _frames(frames, left, None), Message("pairs.side-by-side", sentence)
     if not is_video(right):
         bad_value("RIGHT", f"a video too ({', '.join(VIDEOS)}), or left out", right)
     if (others := video_facts(right, "RIGHT")[0]) != frames:
         cure = "Cut them to the same moments first."
         bad_value("RIGHT", f"a video of {frames} frames, as the left one", f"{others} frames", cure)
-    return _frames(frames, left, right), ""
+    return _frames(frames, left, right), None
 
 
 def _frames(count: int, left: Path, right: Path | None) -> list[PairRef]:

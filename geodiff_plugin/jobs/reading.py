@@ -34,6 +34,7 @@ from geodiff_plugin.formats.images import (
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
 from geodiff_plugin.formats.sfm import check_colmap_names
 from geodiff_plugin.jobs.options import PARAMETERS, DepthOptions, told_apart
+from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Distortion, Rig
 
 Size = tuple[int, int]
@@ -52,7 +53,7 @@ class PairInputs:
     guidance: GeometryGuidance
     undistorted: bool = False
     prior_map: np.ndarray | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[Message, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +63,7 @@ class _Cameras:
     Ks: list[np.ndarray]
     rig: Rig | None = None
     poses: tuple[np.ndarray, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[Message, ...] = ()
 
 
 def read_pair(
@@ -106,7 +107,7 @@ def read_pair(
 
 
 def _cameras_without_poses(options: DepthOptions, sizes: Sequence[Size]) -> _Cameras:
-    way, notes = options.cameras_way(), list[str]()
+    way, notes = options.cameras_way(), list[Message]()
     paths = options.photographs().values()
     Ks = [_intrinsics(options, way, path, i, sizes[i], notes) for i, path in enumerate(paths)]
     return _Cameras(Ks, notes=tuple(notes))
@@ -189,7 +190,7 @@ def _matrix(path: Path, option: str) -> np.ndarray:
 
 
 def _intrinsics(
-    options: DepthOptions, way: str, path: Path, i: int, size: Size, notes: list[str]
+    options: DepthOptions, way: str, path: Path, i: int, size: Size, notes: list[Message]
 ) -> np.ndarray:
     """K of photograph ``i`` without a pose, 0 being the left one, from the options, else from its EXIF."""
     if i > 1 and options.view_k:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,15 +12,16 @@ from typing import Any
 from geodiff_plugin._checks import noted
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.reading import PairInputs
+from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.types import MetricDepthOutput
 
 
 @dataclass
 class JobLog:
-    """Wall-clock seconds of the stages of a job, in their order, and every sentence that they warned of."""
+    """Wall-clock seconds of the stages of a job, in their order, and every message that they warned of."""
 
     seconds: dict[str, float] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[Message] = field(default_factory=list)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -29,7 +30,11 @@ class JobLog:
         with noted() as warned:
             yield
         self.seconds[name] = time.perf_counter() - started
-        self.warnings += [sentence for sentence in warned if sentence not in self.warnings]
+        self.add(warned)
+
+    def add(self, messages: Iterable[Message]) -> None:
+        """Note messages beside those of the stages, each sentence once."""
+        self.warnings = list(distinct(self.warnings, messages))
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import torch
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats.out import REPORT
 from geodiff_plugin.jobs.records import PairRun
+from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.result.confidence import expected_error
 from geodiff_plugin.result.verdict import UNTESTED
 from geodiff_plugin.runtime.machine import versions
@@ -86,6 +88,12 @@ def verdict_report(output: MetricDepthOutput) -> dict[str, Any]:
     return verdict | {"signs": verdict.pop("indicators")}
 
 
+def messages_of(output: MetricDepthOutput, *more: Iterable[Message]) -> list[dict[str, Any]]:
+    """Every message on a result of one image, with its code, as reports have them."""
+    verdict = output.verdict
+    return as_records(verdict.reasons, verdict.remarks, output.warnings, output.assumed, *more)
+
+
 def build_report(run: PairRun) -> dict[str, Any]:
     """The report of a pair without seconds and files, which are known when everything else is written."""
     output, guidance = run.output, run.inputs.guidance
@@ -110,6 +118,7 @@ def build_report(run: PairRun) -> dict[str, Any]:
         "guidance": guidance.as_run().to_dict(),
         "versions": versions(),
         "warnings": run.log.warnings,
+        "messages": messages_of(output, run.log.warnings, run.inputs.notes),
         "undistorted": run.inputs.undistorted,
         "inputs": _cameras(run),
         "prior": run.prior,

@@ -86,6 +86,20 @@ def test_writes_everything(geodiff, command):
     assert f"element vertex {report['files']['cloud_points']}\n".encode() in (out / "cloud.ply").read_bytes()
 
 
+def test_every_sentence_of_a_report_has_its_code(geodiff, command):
+    """One picture given twice, once with an alpha channel, and one K."""
+    Image.open(command[1]).convert("RGBA").save("alpha.png")
+    camera = "--fx 60 --fy 60 --cx 31.5 --cy 23.5 --baseline 0.12".split()
+    assert geodiff("depth", command[1], "alpha.png", *camera, *command[5:], "-q", *QUICK, *GIVEN).code == 0
+    report = report_of()
+    verdict, messages = report["verdict"], report["messages"]
+    said = {*verdict["reasons"], *verdict["remarks"], *report["warnings"], *report["assumed"]}
+    assert {message["text"] for message in messages} == said
+    codes = [message["code"] for message in messages]
+    assert {"views.same", "verdict.not-trusted", "image.alpha", "camera.same-centre"} <= set(codes)
+    assert [m["code"] for m in messages if m["forbids_trust"]] == ["views.same"]
+
+
 def test_json_and_quiet(geodiff, command):
     answer = geodiff(*command, *"--json -q --ensemble 2 --steps 1 --resolution 32".split(), *GIVEN)
     assert (answer.code, answer.err) == (0, "")

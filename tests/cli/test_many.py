@@ -146,6 +146,7 @@ def test_a_finished_pair_is_judged_with_strict(geodiff, finished):
     for name, status in (("a", "trusted"), ("b", "not trusted"), ("c", "trusted")):
         report = report_of(f"out/{name}")
         report["verdict"] |= {"status": status, "reasons": ["E is wrong."]}
+        report["messages"] = [{"code": "pose.inverse"}, {"code": "verdict.not-trusted"}]
         Path("out", name, "report.json").write_text(json.dumps(report))
     answer = geodiff(*COMMAND)
     assert answer.code == 0 and "3 there already, 0 failed, 1 not trusted" in answer.out
@@ -153,6 +154,7 @@ def test_a_finished_pair_is_judged_with_strict(geodiff, finished):
     assert answer.code == 4 and "2 there already, 1 failed" in answer.out
     assert f"geodiff: b: The depth in {Path('out', 'b')} is not trusted: E is wrong." in answer.err
     assert [row["result"] for row in rows_of()] == ["there", "failed", "there"]
+    assert {row["codes"] for row in rows_of()} == {"pose.inverse verdict.not-trusted"}
 
 
 def test_a_broken_pair_and_a_defect_are_reported_and_the_rest_go_on(geodiff, fresh, monkeypatch):

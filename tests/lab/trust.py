@@ -130,7 +130,8 @@ def _measure(ref: SampleRef, other: SampleRef, kind: str, read: Any, pipe: Any, 
             return head | {"status": "refused", "said": [str(error)], "off": None}
         said = [str(warning.message) for warning in caught if warning.category is UserWarning]
     verdict, depth_m = out.verdicts[0], out.prediction[0, ..., 0]
-    said += [sentence for sentence in out.warnings if sentence not in {verdict.sentence, *verdict.remarks}]
+    of_verdict = {message.code for message in (verdict.message, *verdict.remarks) if message is not None}
+    said += [message for message in out.warnings if message.code not in of_verdict]
     errors = np.abs(depth_m[sample.valid] / sample.depth_m[sample.valid] - 1.0)
     off = None if kind == "swapped" else float(np.median(errors))  # the truth is the other image's there
     signs = {name: None if value != value else value for name, value in asdict(verdict.indicators).items()}

@@ -24,6 +24,7 @@ from geodiff_plugin.evaluation.captures import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
 from geodiff_plugin.jobs import capture as run
 from geodiff_plugin.jobs.options import CaptureOptions
+from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.plotting import grid
 from geodiff_plugin.pose.capture import SolvedCapture, candidate_pairs, solve_capture
 from geodiff_plugin.result.indicators import Indicators
@@ -249,7 +250,14 @@ def model(tmp_path, monkeypatch):
 
     found = replace(solved(), E=HALVED, E_given=HALVED, status="kept", points=solved().points / 2)
     monkeypatch.setattr(SOLVE, lambda *_, **__: found)
-    entries = {"unit": None, "K": K[None], "poses": (), "verdict": judge(Indicators()), "warnings": ()}
+    entries = {
+        "unit": None,
+        "K": K[None],
+        "poses": (),
+        "verdict": judge(Indicators()),
+        "warnings": (),
+        "assumed": (),
+    }
     depth = depth_by(lambda capture: length(capture.solve().E) / length(TRUE), **entries)
 
     def with_unit(capture, *args):
@@ -287,10 +295,19 @@ def test_one_length_gives_all_and_without_one_nothing_says_metres(way, model, tm
     assert report["unit"] == json.loads((tmp_path / "out/f04/report.json").read_text())["unit"]
     assert report["unit"] == ("m" if way else None)
     monkeypatch.setattr(run, "write_maps", lambda *_: pytest.fail("done before"))
+    assert [message["text"] for message in report["messages"]] == report["poses"]["notes"]
     again = run.depth_capture(replace(options, overwrite=False))
     assert [frame["frame"] for frame in again["frames"]] == ["f02", "f04", "f06"]
     (tmp_path / "out/poses.npz").write_bytes(b"torn")
     assert run.load_solved(tmp_path / "out/poses.npz", "") is None
+
+
+def test_notes_of_saved_poses_keep_their_codes(tmp_path):
+    notes = Message("capture.kept", "They fit."), Message("capture.parts", "2 parts.")
+    for noted in (notes, ()):
+        run._save_solved(tmp_path / "poses.npz", replace(solved(), notes=noted), "key")
+        loaded = run.load_solved(tmp_path / "poses.npz", "key")
+        assert as_records(loaded.notes) == as_records(noted)
 
 
 def test_frames_that_are_not_trusted_are_named_and_marked(model, monkeypatch):
