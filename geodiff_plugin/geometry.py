@@ -92,13 +92,23 @@ def constant_like(like: Tensor, *values: float) -> Tensor:
     return torch.stack([like.new_full((), value) for value in values])
 
 
+def to_device_of(like: Tensor, matrix: Tensor) -> Tensor:
+    """A camera matrix on the device of ``like``, in its own dtype.
+
+    Cameras stay on the CPU, where decisions about them are taken, until they meet pixels. The host does not
+    wait: a copy of so few bytes from its memory is staged at once.
+    """
+    return matrix.to(like.device, non_blocking=True)
+
+
 def unproject(depth_m: Tensor, K: Tensor) -> Tensor:
     """Points ``(B, H, W, 3)`` metres of a depth map ``(B, 1, H, W)`` in its camera's frame, with skew.
 
     Convention:
         The pixel at the principal point has ``x = y = 0``; one focal length to its right has ``x = z``.
     """
-    return _rays(image_size(depth_m), K.to(depth_m.dtype)) * depth_m[:, 0, ..., None]
+    K = to_device_of(depth_m, K).to(depth_m.dtype)
+    return _rays(image_size(depth_m), K) * depth_m[:, 0, ..., None]
 
 
 def _rays(size: tuple[int, int], K: Tensor) -> Tensor:
@@ -125,7 +135,7 @@ def project(points: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
 
     At or behind the camera (``z <= NEAREST_M``) ``uv`` is finite, outside of any image, without gradient.
     """
-    z = points[..., 2]
+    z, K = points[..., 2], to_device_of(points, K)
     in_front, z_safe = _in_front(z)
     x, y = (points[..., i] / z_safe for i in (0, 1))
     fx, skew, cx, fy, cy = (K[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
@@ -139,6 +149,7 @@ def plane_rays(
     """The part of the projection from a left grid ``(H, W)`` to the right image that does not need depth.
 
     A pixel of depth z has the homogeneous right pixel ``z * A + b``, whose third component is depth there.
+    Rays are made on the device of the cameras.
 
     Source: Eq. 25 (eq:forward-warp_supp), with the products of matrices taken once.
     """
@@ -147,6 +158,12 @@ def plane_rays(
     # Not a matrix product, which TF32 rounds by a quarter pixel.
     A = M[..., 2:] + M[..., 1:2] * y + M[..., :1] * x
     return A, K_right @ T_right_from_left[:, :3, 3:]
+
+
+def rays_of(like: Tensor, K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> PlaneRays:
+    """``plane_rays`` for the grid of a map or an image ``like (B, C, H, W)``, on its device."""
+    K_left, K_right, T = (to_device_of(like, each) for each in (K_left, K_right, T_right_from_left))
+    return plane_rays(K_left, K_right, T, image_size(like))
 
 
 def project_rays(depth_m: Tensor, rays: PlaneRays) -> tuple[Tensor, Tensor]:
@@ -222,7 +239,7 @@ def warp_right_to_left(
         wrong way round for camera-to-world matrices (docs/reference/paper-map.md, E1).
     """
     if rays is None:
-        rays = plane_rays(K_left, K_right, T_right_from_left, image_size(depth_m))
+        rays = rays_of(depth_m, K_left, K_right, T_right_from_left)
     uv, z_right = project_rays(depth_m, rays)
     visible = _inside(uv, z_right, image_size(right))
     return Warped(sample_at(right, uv), visible, uv, z_right)
@@ -246,7 +263,7 @@ def hidden_in_right(
     """
     batch, _, height, width = depth_m.shape
     if rays is None:
-        rays = plane_rays(K_left, K_right, T_right_from_left, (height, width))
+        rays = rays_of(depth_m, K_left, K_right, T_right_from_left)
     uv, z = project_rays(depth_m, rays)
     seen = _inside(uv, z, size_right)[:, 0]  # (B, H, W)
     # No finer than the left grid, else the splatted surface has holes that show what is behind it.

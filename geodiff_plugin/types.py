@@ -94,7 +94,8 @@ class PosedViews(NamedTuple):
     """A left image, the right views that are compared with it, and their cameras; all at one scale.
 
     ``left_01 (3, H, W)`` float32 in [0, 1] and ``K_left (3, 3)`` in pixels of it; of a chunk of samples, each
-    tensor, those of the views too, has a batch axis in front. Without a right view only points are known.
+    tensor, those of the views too, has a batch axis in front. Images are on the device of the call, cameras
+    on the CPU, where decisions about them are taken. Without a right view only points are known.
     """
 
     left_01: torch.Tensor

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.geometry import hidden_in_right, image_size, plane_rays, warp_right_to_left
+from geodiff_plugin.geometry import hidden_in_right, image_size, rays_of, warp_right_to_left
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import AffineState, MetricMap
 from geodiff_plugin.types import PosedViews
@@ -267,7 +267,7 @@ class Objective:
 
     def __init__(self, views: PosedViews, metric: MetricMap, config: GuidanceConfig) -> None:
         self.views, self.metric, self.config = views, metric, config
-        self._rays = [plane_rays(views.K_left, K, T, views.size) for _, K, T in views.views]  # once a chunk
+        self._rays = [rays_of(views.left_01, views.K_left, K, T) for _, K, T in views.views]  # once a chunk
 
     def metric_depth(self, x: Tensor, affine: AffineState) -> Tensor:
         """``x (B, 1, h, w)`` resized to the loss grid, then Eq. 16: ``(B, 1, H, W)`` metres."""

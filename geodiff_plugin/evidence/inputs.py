@@ -39,13 +39,10 @@ class Inputs:
     unit: str | None = "m"
 
     def beside(self, left_01: Tensor) -> PosedViews:
-        """The left image with its right views and K, float32 on its device."""
-
-        def moved(x: np.ndarray | Tensor) -> Tensor:
-            return torch.as_tensor(x, dtype=torch.float32, device=left_01.device)
-
-        views = tuple(CameraView(*map(moved, view)) for view in self.views)
-        return PosedViews(left_01, views, moved(self.K_left))
+        """The left image with its right views on its device, and their cameras on the CPU; all float32."""
+        device = left_01.device
+        views = tuple(view._replace(image_01=view.image_01.to(device, torch.float32)) for view in self.views)
+        return PosedViews(left_01, views, torch.from_numpy(self.K_left).float())
 
     def points_on(self, device: torch.device) -> Tensor | None:
         """The known depths, float32 on a device."""

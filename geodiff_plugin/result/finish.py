@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -23,7 +23,7 @@ from geodiff_plugin.matching import Matches, build_cost_volume, match_volume
 from geodiff_plugin.messages import Message
 from geodiff_plugin.result.confidence import depth_confidence, reprojection
 from geodiff_plugin.result.ensemble import median, spread_around
-from geodiff_plugin.result.indicators import Indicators, read_indicators
+from geodiff_plugin.result.indicators import Indicators, indicators_of, measure_indicators, read_numbers
 from geodiff_plugin.result.verdict import Verdict, judge, points_agreement
 from geodiff_plugin.result.voting import vote_depth
 from geodiff_plugin.scale.points import order_agreement
@@ -47,7 +47,7 @@ class ResultOptions:
 class ImageResult:
     """Everything that is known about the depth of one image; what does not apply is ``None``.
 
-    Maps are ``(1, 1, H, W)``, of the size of ``depth_m``; numbers of its ``E`` members are on the CPU.
+    Maps are ``(1, 1, H, W)``, of the size of ``depth_m``; tensors are on the device of the call.
     """
 
     evidence: Evidence
@@ -58,6 +58,7 @@ class ImageResult:
     shift: Tensor  # (E,)
     global_scale: Tensor  # (E,) metres
     verdict: Verdict
+    visible_share: float = 1.0  # of the pixels that a right view sees; 1 without a right view
     uncertainty: Tensor | None = None  # metres
     visible: Tensor | None = None  # bool, whether a right view sees the pixel
     photometric_error: Tensor | None = None  # [0, 1]
@@ -115,8 +116,9 @@ def finish(
         confidence = depth_confidence(support, *seen, spread, prior_error)
     over_prior = _over_prior(members, depth_m)
     relative = median(torch.cat([member.relative for member in members]), 0)[None]
-    measured = _Measured(depth_m, relative, confidence, over_prior)
-    verdict = judge(_indicators(evidence, members, measured, options))
+    measured = _Measured(depth_m, relative, confidence, over_prior, visible)
+    numbers = read_numbers(_numbers(evidence, members, measured, options))
+    verdict = judge(_indicators(evidence, numbers, options))
     if confidence is not None:
         confidence = confidence * points_agreement(verdict.indicators)
     return ImageResult(
@@ -124,10 +126,11 @@ def finish(
         depth_m=depth_m,
         K=K[0],
         relative=_resized(relative, size, antialias=False),
-        scale=torch.cat([member.affine.scale for member in members]).cpu(),
-        shift=torch.cat([member.affine.shift for member in members]).cpu(),
-        global_scale=torch.cat([member.affine.g_s for member in members]).cpu(),
+        scale=torch.cat([member.affine.scale for member in members]),
+        shift=torch.cat([member.affine.shift for member in members]),
+        global_scale=torch.cat([member.affine.g_s for member in members]),
         verdict=verdict,
+        visible_share=numbers.get("visible", 1.0),
         uncertainty=uncertainty,
         visible=visible,
         photometric_error=error,
@@ -213,39 +216,45 @@ def _over_prior(members: Sequence[Member], depth_m: Tensor) -> Tensor | None:
 
 
 class _Measured(NamedTuple):
-    """Maps of one image that its indicators are read from."""
+    """Maps of one image that its indicators are measured on."""
 
     depth_m: Tensor
     relative: Tensor
     confidence: Tensor | None
     over_prior: Tensor | None
+    visible: Tensor | None
 
 
-def _indicators(
+def _numbers(
     evidence: Evidence, members: Sequence[Member], measured: _Measured, options: ResultOptions
-) -> Indicators:
-    """Indicators of one image; if its run used no matches, they are made here for the verdict."""
+) -> dict[str, Tensor]:
+    """What is to be read from the device of one image; if its run used no matches, they are made here."""
     correlations = [m.rank_correlation for m in members if m.rank_correlation is not None]
-    correlation = torch.cat(correlations).nanmean()
+    numbers = {"rank_correlation": torch.cat(correlations).nanmean()}
     if evidence.matches is None and evidence.native.views:
         with suppress(InputError):  # views without overlap: not judged
             matches = _matched(evidence, options.config)
             evidence = replace(evidence, matches=matches, points=None)
             correlation = order_agreement(measured.relative, matches, members[0].metric.space)
-    further: dict[str, float] = {}
+            numbers["rank_correlation"] = correlation.mean()
+    edges = [m.on_edge for m in members if m.on_edge is not None]
+    if edges:
+        numbers["on_edge"] = torch.cat(edges).any()
     if measured.confidence is not None:
-        further["confidence"] = float(measured.confidence.mean())
+        numbers["confidence"] = measured.confidence.mean()
     if measured.over_prior is not None and options.has_unit:
-        further["prior_ratio"] = float(measured.over_prior.median())
-    return read_indicators(
-        evidence,
-        measured.depth_m[0],
-        range_given=options.config.depth_range is not None,
-        has_unit=options.has_unit,
-        rank_correlation=float(correlation),
-        on_edge=any(m.on_edge is not None and bool(m.on_edge) for m in members),
-        doubts=options.doubts,
-        **further,
+        numbers["prior_ratio"] = measured.over_prior.median()
+    if measured.visible is not None:
+        numbers["visible"] = measured.visible.float().mean()
+    return numbers | measure_indicators(evidence, measured.depth_m, options.config.depth_range is not None)
+
+
+def _indicators(evidence: Evidence, numbers: Mapping[str, float], options: ResultOptions) -> Indicators:
+    names = ("rank_correlation", "confidence", "prior_ratio")
+    further: dict[str, Any] = {name: numbers[name] for name in names if name in numbers}
+    on_edge = numbers.get("on_edge", 0.0) > 0
+    return indicators_of(
+        evidence, numbers, options.has_unit, on_edge=on_edge, doubts=options.doubts, **further
     )
 
 

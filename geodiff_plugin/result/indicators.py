@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.formats.depth import row_strips
+from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.mistakes import INVERSE
@@ -28,6 +30,8 @@ FEWEST_COMPARED = 12
 REACH_PX = 3
 #: Least number of matches that say something about the depths of the scene.
 FEWEST_MATCHES = 40
+#: Upper bound on the values that are sorted for a quantile; torch's own is four times as many.
+MOST_SORTED = 1 << 22
 #: Log of the ratio of the 95 % and the 5 % quantile of depth below which a scene may be one plane.
 FLAT = 0.2
 #: A point that differs from the matches by this factor contradicts them (log).
@@ -62,84 +66,127 @@ class Indicators:
     on_edge: bool = False  # the search for the scale ended on the edge of its range
 
 
-def _alike(image_01: Tensor, left_01: Tensor) -> bool:
-    """Whether no value differs by more than rounding; most images differ in their first rows."""
-    if image_01.shape != left_01.shape:
-        return False
-    darkest, brightest = left_01.aminmax()
-    most, strips = min(SAME, SAME_SHARE * float(brightest - darkest)), row_strips(*left_01.shape[-2:])
-    return all(float((image_01[:, rows] - left_01[:, rows]).abs().max()) < most for rows in strips)
+def read_numbers(numbers: Mapping[str, Tensor]) -> dict[str, float]:
+    """Numbers ``()`` that lie on a device, read together: every read waits for the device."""
+    if not numbers:
+        return {}
+    return dict(zip(numbers, torch.stack([x.float() for x in numbers.values()]).tolist(), strict=True))
 
 
-def _points_indicators(matches: Matches, points: Matches) -> dict[str, float]:
-    """Median ratio of points to matched depths, and the share that differs; empty for too few of them."""
+def measure_indicators(evidence: Evidence, depth_m: Tensor, range_given: bool) -> dict[str, Tensor]:
+    """What of the indicators has to be measured on the maps of one image, ``()`` each, on their device.
+
+    ``depth_m (1, 1, H, W)`` is its result; ``range_given``: the user gave the range of the search.
+    """
+    numbers: dict[str, Tensor] = {}
+    left_01 = evidence.native.left_01
+    same_size = [view for view in evidence.native.views if view.image_01.shape == left_01.shape]
+    if same_size:
+        differences = [_largest_difference(view.image_01, left_01) for view in same_size]
+        darkest, brightest = left_01.aminmax()
+        numbers |= {"difference": torch.stack(differences).amin(), "contrast": brightest - darkest}
+    matches, points, volume = evidence.matches, evidence.points, evidence.volume
+    if matches is not None:
+        planes = volume.inverse_depth if range_given and volume is not None else None
+        numbers |= _measure_matches(matches, depth_m, planes)
+        if points is not None:
+            numbers |= _measure_points(matches, points)
+    if points is not None:
+        known = (points.confidence > 0).float()
+        numbers |= {"points": known.sum(), "cover": F.adaptive_max_pool2d(known, 8).mean()}
+    return numbers
+
+
+def _largest_difference(image_01: Tensor, left_01: Tensor) -> Tensor:
+    """The largest difference ``()`` of two images of one size, strip by strip to spare memory."""
+    strips = row_strips(*image_size(left_01))
+    return torch.stack([(image_01[:, rows] - left_01[:, rows]).abs().amax() for rows in strips]).amax()
+
+
+def _where(values: Tensor, at: Tensor) -> Tensor:
+    """The values of a mask, and NaN elsewhere: a selection has a size that only the device knows."""
+    return torch.where(at, values, torch.nan)
+
+
+def _measure_points(matches: Matches, points: Matches) -> dict[str, Tensor]:
+    """Median ratio of points to matched depths, the share that differs, and how many are compared."""
     confident = (matches.confidence > CONFIDENT).float()
     window = (2 * REACH_PX + 1, 1, REACH_PX)
     near = F.avg_pool2d(confident[None], *window)[0]
     mean = F.avg_pool2d((confident * matches.inverse_depth)[None], *window)[0] / near.clamp_min(1e-6)
     at = (points.confidence > 0) & (near > 0) & (mean > matches.plane_step)
-    if int(at.sum()) < FEWEST_COMPARED:
-        return {}
-    ratio = mean[at] / points.inverse_depth[at]
-    off = (ratio.log().abs() > POINTS_WRONG).float().mean()
-    return {"points_ratio": float(ratio.median()), "points_off": float(off)}
+    ratio = _where(mean / points.inverse_depth, at)
+    off = (ratio.log().abs() > POINTS_WRONG) & at
+    compared = at.sum()
+    return {
+        "points_ratio": ratio.flatten().nanmedian(),
+        "points_off": off.sum() / compared.clamp_min(1),
+        "points_compared": compared,
+    }
 
 
-def _match_indicators(matches: Matches, depth_m: Tensor | None, planes: Tensor | None) -> dict[str, Any]:
+def _measure_matches(matches: Matches, depth_m: Tensor, planes: Tensor | None) -> dict[str, Tensor]:
     """Share matched, spread of the depths, deviation of the result, share on the first or last plane."""
-    confident = matches.confidence > CONFIDENT
-    numbers: dict[str, Any] = {"matched": float(confident.float().mean())}
-    inverse_depth = matches.inverse_depth[confident & (matches.inverse_depth > 0)]
-    if len(inverse_depth) >= FEWEST_MATCHES:
-        sample = inverse_depth[:: max(1, len(inverse_depth) // 100_000)]
-        low, high = torch.quantile(sample, sample.new_tensor([0.05, 0.95]))
-        spread = float((high / low.clamp_min(1e-9)).log())
-        flat = spread < FLAT and float(high - low) < 2.0 * float(matches.plane_step)
-        numbers |= {"spread": spread, "flat": flat}
-        if planes is not None:
-            ends = (inverse_depth - planes[[0, -1], None]).abs().amin(0) < 0.75 * matches.plane_step
-            numbers["at_end"] = float(ends.float().mean())
-    at = confident & (matches.inverse_depth > matches.plane_step)
-    if depth_m is not None and int(at.sum()) >= FEWEST_MATCHES:
-        resized = F.interpolate(depth_m[None].float(), matches.size, mode="nearest-exact")[0]
-        numbers["off_matches"] = float((resized * matches.inverse_depth)[at].log().abs().median())
-    return numbers
+    confident, step = matches.confidence > CONFIDENT, matches.plane_step
+    in_front = confident & (matches.inverse_depth > 0)
+    inverse_depth = _where(matches.inverse_depth, in_front)
+    sample = inverse_depth.flatten()[:: max(1, inverse_depth.numel() // MOST_SORTED)]
+    low, high = (torch.nanquantile(sample, share) for share in (0.05, 0.95))
+    numbers = {"matched": confident.float().mean(), "in_front": in_front.sum()}
+    numbers |= {"spread": (high / low.clamp_min(1e-9)).log(), "planes_apart": (high - low) / step}
+    if planes is not None:
+        first, last = ((inverse_depth - planes[end]).abs() < 0.75 * step for end in (0, -1))
+        numbers["at_end"] = (first | last).sum() / in_front.sum().clamp_min(1)
+    at = confident & (matches.inverse_depth > step)
+    resized = F.interpolate(depth_m.float(), matches.size, mode="nearest-exact")[0]
+    off = _where((resized * matches.inverse_depth).log().abs(), at)
+    return numbers | {"off_matches": off.flatten().nanmedian(), "off_where": at.sum()}
 
 
-def read_indicators(
-    evidence: Evidence,
-    depth_m: Tensor | None = None,
-    *,
-    range_given: bool = False,
-    has_unit: bool = True,
-    **more: Any,
+def indicators_of(
+    evidence: Evidence, numbers: Mapping[str, float], has_unit: bool = True, **further: Any
 ) -> Indicators:
-    """The indicators of one image, of the result ``depth_m (1, H, W)``, and ``more`` that are known already.
+    """The indicators of one image, from ``measure_indicators``, as ``read_numbers`` reads them.
 
-    ``range_given``: the user gave the range of the search; ``has_unit``: lengths are in metres, so that the
+    ``further`` are indicators that are known already. ``has_unit``: lengths are in metres, so that the
     length of a baseline means something.
     """
-    matches, pose, native = evidence.matches, evidence.pose, evidence.native
-    if matches is not None:
-        planes = evidence.volume.inverse_depth if range_given and evidence.volume is not None else None
-        more |= _match_indicators(matches, depth_m, planes)
-        if evidence.points is not None:
-            more |= _points_indicators(matches, evidence.points)
+    pose, native = evidence.pose, evidence.native
+    known: dict[str, Any] = {name: numbers[name] for name in ("matched", "cover") if name in numbers}
+    known |= {"points": round(numbers["points"])} if "points" in numbers else {}
+    known |= _of_matches(numbers)
+    known |= further
     if pose is not None:
         for name, residuals in (("epipolar_px", pose.residual_px), ("given_px", pose.residual_px_given)):
-            more[name] = max((px for px in residuals if not math.isnan(px)), default=math.nan)
+            known[name] = max((px for px in residuals if not math.isnan(px)), default=math.nan)
         if pose.status == "mistaken":
-            more["mistakes"] = tuple(m for m in pose.warnings if m.code != INVERSE.code)
-    if evidence.points is not None:
-        known = (evidence.points.confidence > 0).float()
-        more |= {"points": int(known.sum()), "cover": float(F.adaptive_max_pool2d(known, 8).mean())}
+            known["mistakes"] = tuple(m for m in pose.warnings if m.code != INVERSE.code)
     if native.views and has_unit:
-        more["baseline_m"] = float(native.views[0].T_right_from_left[:3, 3].norm())
-        more["scale_spread"] = (pose and pose.scale_spread) or math.nan
+        known["baseline_m"] = float(native.views[0].T_right_from_left[:3, 3].norm())
+        known["scale_spread"] = (pose and pose.scale_spread) or math.nan
     half_width = 0.5 * native.size[1]
     return Indicators(
-        **more,
+        **known,
         view_deg=2.0 * math.degrees(math.atan(half_width / float(native.K_left[0, 0]))),
-        same=any(_alike(view.image_01, native.left_01) for view in native.views),
+        same=_is_same(numbers),
         inverse_fits=any(message.code == INVERSE.code for message in evidence.warnings),
     )
+
+
+def _of_matches(numbers: Mapping[str, float]) -> dict[str, Any]:
+    """Indicators that say something only if enough matches, or points, were compared."""
+    known: dict[str, Any] = {}
+    if numbers.get("in_front", 0) >= FEWEST_MATCHES:
+        spread = numbers["spread"]
+        known |= {"spread": spread, "flat": spread < FLAT and numbers["planes_apart"] < 2.0}
+        known |= {name: numbers[name] for name in ("at_end",) if name in numbers}
+    if numbers.get("off_where", 0) >= FEWEST_MATCHES:
+        known["off_matches"] = numbers["off_matches"]
+    if numbers.get("points_compared", 0) >= FEWEST_COMPARED:
+        known |= {name: numbers[name] for name in ("points_ratio", "points_off")}
+    return known
+
+
+def _is_same(numbers: Mapping[str, float]) -> bool:
+    """Whether no value of a right view differs from the left one by more than rounding."""
+    return numbers.get("difference", math.inf) < min(SAME, SAME_SHARE * numbers.get("contrast", 0.0))

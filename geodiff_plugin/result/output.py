@@ -18,6 +18,8 @@ from geodiff_plugin.types import MetricDepthOutput, StepReport
 
 #: The user is warned if the visible share is below this: few pixels then determine the scale.
 LITTLE_OVERLAP = 0.3
+#: Fields of ``ImageResult`` that are maps.
+MAPS = ("depth_m", "uncertainty", "relative", "visible", "photometric_error", "confidence", "support")
 
 
 def stack_results(
@@ -34,36 +36,19 @@ def stack_results(
     ``history`` are the reports of its steps, ``remarks`` warnings that say nothing about one image alone,
     and ``extras`` further maps of the prior.
     """
-
-    def numbers(name: str) -> Tensor:
-        return torch.stack([getattr(result, name) for result in results])
-
-    def maps(name: str) -> Any:
-        return out(_together([getattr(result, name) for result in results]))
-
-    def out(x: Tensor | None) -> Any:
-        return x if not as_numpy or x is None else x.permute(0, 2, 3, 1).cpu().numpy()
-
-    over_prior = _together([result.over_prior for result in results])
-    prior_error = _together([result.prior_error for result in results])
-    poses, estimated, K = [result.evidence.pose for result in results], guidance.estimated, numbers("K")
+    maps = _read_out({name: _together(results, name) for name in MAPS}, as_numpy)
+    over_prior = _together(results, "over_prior")
+    numbers: dict[str, Any] = dict(to_host(_numbers(results, over_prior)))
+    K = torch.stack([result.K for result in results])
+    poses, estimated = [result.evidence.pose for result in results], guidance.estimated
     output = MetricDepthOutput(
-        prediction=maps("depth_m"),
-        uncertainty=maps("uncertainty"),
-        relative=maps("relative"),
-        scale=numbers("scale"),
-        shift=numbers("shift"),
-        global_scale=numbers("global_scale"),
-        prior_scale=None if over_prior is None else over_prior.median(1).values.view(len(results), -1).cpu(),
-        visible=maps("visible"),
-        photometric_error=maps("photometric_error"),
-        confidence=maps("confidence"),
-        support=maps("support"),
-        prior_error=None if prior_error is None else prior_error.amin((1, 2, 3)).cpu(),
-        K=K.cpu().numpy() if as_numpy else K,
+        prediction=maps.pop("depth_m"),
+        **maps,
+        **numbers,
+        K=K.numpy() if as_numpy else K.to(results[0].depth_m.device),
         history=list(history),
         poses=[pose for pose in poses if pose is not None],
-        extras={name: out(extra) for name, extra in (extras or {}).items()},
+        extras=_read_out(extras or {}, as_numpy),
         verdicts=[result.verdict for result in results],
         unit=guidance.unit,
         warnings=[*_warnings(results), *(() if estimated is None else estimated.warnings), *remarks],
@@ -76,12 +61,41 @@ def stack_results(
     return output
 
 
-def _together(of_images: Sequence[Tensor | None]) -> Tensor | None:
+def _together(results: Sequence[ImageResult], name: str) -> Tensor | None:
     """What every image has, along the first axis, a single one not copied; ``None`` if one has none."""
-    given = [each for each in of_images if each is not None]
-    if len(given) < len(of_images):
+    given = [each for result in results if (each := getattr(result, name)) is not None]
+    if len(given) < len(results):
         return None
     return given[0] if len(given) == 1 else torch.cat(given)
+
+
+def _numbers(results: Sequence[ImageResult], over_prior: Tensor | None) -> dict[str, Tensor]:
+    """Numbers of every image and member, by their names in ``MetricDepthOutput``, on their device."""
+    names = ("scale", "shift", "global_scale")
+    numbers = {name: torch.stack([getattr(result, name) for result in results]) for name in names}
+    if over_prior is not None:
+        numbers["prior_scale"] = over_prior.median(1).values.view(len(results), -1)
+    prior_error = _together(results, "prior_error")
+    if prior_error is not None:
+        numbers["prior_error"] = prior_error.amin((1, 2, 3))
+    return numbers
+
+
+def _read_out(maps: Mapping[str, Tensor | None], as_numpy: bool) -> dict[str, Any]:
+    """Maps as the user gets them: tensors, or arrays with the channels last."""
+    if not as_numpy:
+        return dict(maps)
+    known = to_host({name: x.permute(0, 2, 3, 1) for name, x in maps.items() if x is not None})
+    return {name: known[name].numpy() if name in known else None for name in maps}
+
+
+def to_host(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors on the CPU; those of a CUDA device are all copied before it is waited for, once."""
+    # Elsewhere a copy that is not waited for would be read too early.
+    copies = {name: x.to("cpu", non_blocking=x.is_cuda) for name, x in tensors.items()}
+    for device in {x.device for x in tensors.values() if x.is_cuda}:
+        torch.cuda.current_stream(device).synchronize()
+    return copies
 
 
 def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> MetricDepthOutput:
@@ -127,7 +141,7 @@ def _messages(result: ImageResult) -> list[Message]:
     verdict = result.verdict
     messages = [] if verdict.message is None else [verdict.message]
     messages += verdict.remarks
-    share = 1.0 if result.visible is None else result.visible.float().mean().item()
+    share = result.visible_share
     if share < LITTLE_OVERLAP:
         sentence = (
             f"Only {share:.0%} of the left image is seen by a right camera at this depth; "

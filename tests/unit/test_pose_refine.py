@@ -16,7 +16,7 @@ from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit
 from geodiff_plugin.pose.refine import fit_displacement, refine_views, straightened, undecided
 from geodiff_plugin.pose.solve import PosePrior, is_rig, settle_poses, solve_poses
 from geodiff_plugin.pose.tracks import Tracks, median_residuals, residuals_px, solve_inverse_depth
-from geodiff_plugin.result.indicators import read_indicators
+from geodiff_plugin.result.indicators import indicators_of
 from geodiff_plugin.types import CameraView, PosedViews
 from tests.scenes import render_pair
 
@@ -241,8 +241,8 @@ def test_a_tracker_keeps_the_scene_and_a_measured_baseline_its_length(pair) -> N
     assert report.scale_spread > 0.05  # even where both lengths agree
     native = PosedViews(*posed(pair, wrong))
     seen = Evidence(native, grid=native, volume=None, matches=None, pose=report)
-    assert read_indicators(seen).scale_spread == report.scale_spread
-    assert np.isnan(read_indicators(seen, has_unit=False).scale_spread)
+    assert indicators_of(seen, {}).scale_spread == report.scale_spread
+    assert np.isnan(indicators_of(seen, {}, has_unit=False).scale_spread)
 
 
 def test_views_are_used_as_given_where_no_better_pose_is_near(pair) -> None:
