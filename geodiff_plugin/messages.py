@@ -421,8 +421,18 @@ MESSAGES: dict[str, MessageKind] = {
     ),
     "capture.skipped": MessageKind(
         "Frames are skipped",
-        cause="A frame has no image file or no pose.",
-        cure="Nothing, unless they should have both.",
+        cause="A frame has no image file, no pose, or a camera that cannot be used; the message says which.",
+        cure="Nothing if the others suffice.",
+    ),
+    "capture.part": MessageKind(
+        "A part of what the folder holds is read",
+        cause="It has several models, splits or cameras, of which one is taken.",
+        cure="Name the file or folder of another one to take that.",
+    ),
+    "capture.stored-pixels": MessageKind(
+        "The EXIF orientation of frames is not applied",
+        cause="The cameras of the capture are those of the pixels as the image files store them.",
+        cure="Nothing: depth comes out in the stored pixels too.",
     ),
     "capture.assumed-k": MessageKind(
         "K of the data set's cameras is assumed",

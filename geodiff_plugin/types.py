@@ -16,7 +16,8 @@ from geodiff_plugin.messages import Message
 class Distortion:
     """Lens distortion of one camera: ``coefficients`` in OpenCV's order.
 
-    ``model`` is ``"opencv"`` (k1, k2, p1, p2, k3 and so on) or ``"fisheye"`` (k1 to k4).
+    ``model`` is ``"opencv"`` (k1, k2, p1, p2, k3 and so on), ``"fisheye"`` (k1 to k4), or the name of a model
+    of COLMAP that OpenCV does not have, such as ``"FOV"``, with its coefficients behind cx and cy.
     """
 
     model: str

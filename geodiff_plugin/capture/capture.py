@@ -16,9 +16,11 @@ from geodiff_plugin._checks import bad_value, check_choice, check_number
 from geodiff_plugin._threads import available_cores
 from geodiff_plugin.capture import NEIGHBOURS, POINTS
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.formats.captures import CaptureFrame, read_capture
-from geodiff_plugin.formats.depth import read_depth_png
-from geodiff_plugin.formats.images import read_image, undistorted
+from geodiff_plugin.formats.captures import read_capture
+from geodiff_plugin.formats.depth import read_measured
+from geodiff_plugin.formats.images import read_image
+from geodiff_plugin.formats.layouts import CaptureFrame
+from geodiff_plugin.formats.lenses import undistorted
 from geodiff_plugin.formats.recordings import VideoReader
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.capture import SolvedCapture, solve_capture
@@ -26,8 +28,6 @@ from geodiff_plugin.types import MetricDepthOutput
 
 #: A solve that moved the given poses, or estimated them; its points count from this many frames on.
 ADJUSTED, FEWEST_FRAMES = ("solved", "estimated"), 3
-#: What 7-Scenes writes where depth is unknown.
-NO_DEPTH = 65535
 #: Angle of two rays that a match is worth most at, degrees, and how fast it is worth less below and above it.
 BEST_ANGLE_DEG, NARROWER_DEG, WIDER_DEG = 6.0, 2.5, 10.0
 #: A point that a chosen neighbour sees already counts so much for the next one.
@@ -53,6 +53,8 @@ class Capture:
     ) -> None:
         self.frames, self.kind, self.unit, self.notes = list(frames), kind, unit, list(notes)
         self.names = [frame.name for frame in frames]
+        if len(set(self.names)) < len(self.names):  # one would be taken for the other
+            bad_value("the frames", "of different names", ", ".join(self.names))
         self.solved: SolvedCapture | None = None
         self._way: str | None = None  # how it was solved
         self._video: VideoReader | None = None
@@ -145,14 +147,14 @@ class Capture:
             self.solved = replace(solved, E=solved.E * longer, E_given=given, points=solved.points * factor)
 
     def image(self, name: str) -> np.ndarray:
-        """``(H, W, 3)`` float32 in [0, 1], upright, free of lens distortion."""
+        """``(H, W, 3)`` float32 in [0, 1], in the pixels of its camera, free of lens distortion."""
         frame = self.frame(name)
         if frame.index is not None:
             if self._video is None:
                 self._video = VideoReader(frame.image, f"the video {frame.image}")
             image = self._video.read(frame.index)
         else:
-            image = read_image(frame.image, f"frame {name}")[0]
+            image = read_image(frame.image, f"frame {name}", as_stored=frame.as_stored)[0]
         return image if frame.lens is None else undistorted(image, frame.K, frame.lens)
 
     def neighbours(self, name: str, count: int = NEIGHBOURS) -> list[str]:
@@ -228,8 +230,7 @@ class Capture:
         frame = self.frame(name)
         if frame.depth is None:
             bad_value("points", "depth maps that the capture names", f"none for {name}")
-        depth_m, known = read_depth_png(frame.depth, frame.depth_per_m, f"the depth map of {name}")
-        return depth_m, known & (depth_m < NO_DEPTH / frame.depth_per_m)
+        return read_measured(frame.depth, frame.depth_per_m, f"the depth map of {name}")
 
     def depth(
         self,

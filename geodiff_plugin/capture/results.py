@@ -16,9 +16,9 @@ from geodiff_plugin._checks import InputFileError, warn
 from geodiff_plugin.capture.agreement import DepthFrame, agreed, scene_poses, steadied
 from geodiff_plugin.capture.capture import Capture, choose_neighbours
 from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb, write_vertices
+from geodiff_plugin.formats.colmap import write_colmap
 from geodiff_plugin.formats.depth import write_depth_mm, write_depth_npy
 from geodiff_plugin.formats.out import atomic_path, write_text
-from geodiff_plugin.formats.sfm import write_colmap
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.capture import Observations
 

@@ -8,13 +8,15 @@ from typing import Any
 #: What other programs use, by module; imported on first use, since some of them need torch.
 _NAMES = {
     "clouds": ("Cloud", "flying_points", "make_cloud", "make_mesh", "write_glb", "write_ply"),
-    "depth": ("read_depth_png", "read_pfm", "read_points", "write_depth_mm", "write_depth_npy", "write_pfm"),
+    "colmap": ("write_colmap",),
+    "depth": ("read_depth_png", "write_depth_mm", "write_depth_npy", "write_pfm"),
     "files": ("check_file", "read_matrix", "read_text"),
     "images": ("as_image_01", "picture_size", "read_image"),
+    "maps": ("read_pfm",),
     "out": ("atomic_path",),
+    "points": ("read_points",),
     "reading": ("CALIBRATION_FORMATS", "read_calibration"),
     "rigs": ("rig_from_parameters",),
-    "sfm": ("write_colmap",),
 }
 
 __all__ = sorted(name for names in _NAMES.values() for name in names)  # noqa: PLE0605

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
 
-from geodiff_plugin._camera_checks import check_metres
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.formats.files import PathLike, check_file, open_image, read_npy, read_rows
+from geodiff_plugin.formats.files import PathLike, check_file, open_image, read_npy
+from geodiff_plugin.formats.maps import read_map_file, read_pfm
 from geodiff_plugin.formats.out import atomic_path
 
 if TYPE_CHECKING:  # which imports torch
@@ -22,10 +20,10 @@ if TYPE_CHECKING:  # which imports torch
 LARGEST_MM, MILLIMETRES, KITTI_UNITS = 65535, 1000.0, 256.0
 #: Pixels of a strip: a map of float64 of so many is 8 MB.
 STRIP_PIXELS = 1 << 20
-MAP_FILES = "a map (H, W) as .npy, .npz, .pfm or 16-bit .png"
-KINDS = "a 16-bit PNG (mm), a .pfm or .npy map, or points as .npy, text or .ply, in metres"
-COLUMNS = (3, 4, 6)  # x y z, with an intensity, or with a colour
-NUMBER = re.compile(r"[-+]?(\d.*|\..*|nan|inf)", re.IGNORECASE)
+#: Disparities of which this share is negative have another sign.
+MOST_NEGATIVE = 0.5
+#: Maps of these are 0 where unknown.
+PICTURES = (".png", ".tif", ".tiff")
 
 
 def row_strips(height: int, width: int) -> Iterator[slice]:
@@ -33,23 +31,6 @@ def row_strips(height: int, width: int) -> Iterator[slice]:
     rows = max(1, STRIP_PIXELS // max(1, width))
     for top in range(0, height, rows):
         yield slice(top, min(top + rows, height))
-
-
-def read_pfm(path: PathLike, name: str = "map") -> np.ndarray:
-    """The ``(H, W)`` float32 of a grey portable float map, top row first, unlike the file."""
-    file = check_file(path, name, "a PFM file")
-    with open(file, "rb") as stream:
-        kind = stream.readline(8).strip()
-        try:
-            width, height = (int(word) for word in stream.readline(64).split())
-            scale = float(stream.readline(64))
-        except ValueError:
-            kind, width, height, scale = b"", 0, 0, 0.0
-        data = stream.read()
-    if kind != b"Pf" or min(width, height) < 1 or len(data) < 4 * width * height:
-        bad_value(name, "a whole grey PFM file (Pf, size, scale)", file, "Is it cut off, or a PNG or npy?")
-    values = np.frombuffer(data, dtype="<f4" if scale < 0 else ">f4", count=width * height)
-    return np.flipud(values.reshape(height, width)).astype(np.float32)
 
 
 def write_pfm(path: PathLike, values: np.ndarray) -> None:
@@ -105,53 +86,28 @@ def read_depth_png(
     return values.astype(np.float32) / np.float32(units_per_m), values > 0
 
 
+def read_measured(
+    path: PathLike, per_m: float | None = None, name: str = "depth"
+) -> tuple[np.ndarray, np.ndarray]:
+    """``(H, W)`` float32 metres of a depth map of a sensor, and where it is known.
+
+    ``per_m`` is how many units of the file a metre has; ``None`` for floats in metres and whole millimetres.
+    16-bit PNG, ``.npy``, TIFF, PFM and EXR are read; 65535 of 16 bits is unknown, as 7-Scenes writes it.
+    """
+    values = read_map_file(path, name)
+    whole = values.dtype.kind in "iu"
+    known = np.isfinite(values) & (values > 0)
+    if values.dtype == np.uint16:
+        known &= values < LARGEST_MM
+    units = per_m or (MILLIMETRES if whole else 1.0)
+    return np.where(known, values, 0).astype(np.float32) / np.float32(units), known
+
+
 def read_map(path: PathLike, name: str = "map") -> np.ndarray:
     """The ``(H, W)`` map of a depth model, in its own unit and space; NaN where unknown."""
-    file = check_file(path, name, MAP_FILES)
-    kind = file.suffix.lower()
-    if kind == ".png":
-        values, valid = read_depth_png(file, 1.0, name)
-        values = np.where(valid, values, np.nan)
-    elif kind == ".npz":
-        try:
-            with open(file, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
-                values = archive["depth" if "depth" in archive.files else " ".join(archive.files)]
-        except Exception as error:  # of any kind that a damaged file leads to
-            bad_value(name, "an .npz with 'depth' or a single array", f"{file} ({error})")
-    else:
-        values = read_pfm(file, name) if kind == ".pfm" else read_npy(file, name, MAP_FILES)
-    values = np.squeeze(values)
-    if values.ndim != 2 or values.dtype.kind not in "fiu":
-        bad_value(name, MAP_FILES, f"{file} of shape {values.shape}", "Save one map of the left image.")
-    return np.where(np.isfinite(values), values, np.nan)
-
-
-def read_points(path: PathLike, name: str = "points", *, scale: float | None = None) -> np.ndarray:
-    """Read known depths of the left image: ``(H, W)`` float32 metres, 0 where unknown, or ``(N, 3)``.
-
-    Points are in the left camera's frame: ``.npy`` or text of 3, 4 or 6 columns, or with a heading that names
-    x, y and z; ``.ply``. ``scale`` is the units of the file in a metre: 1000 for millimetres, 256 for
-    KITTI's PNG.
-    """
-    file = check_file(path, name, "a file of known depths")
-    if scale is not None:
-        check_number(scale, f"{name}-scale", 1e-9, 1e9)
-    kind = file.suffix.lower()
-    if kind == ".png":
-        return read_depth_png(file, scale or MILLIMETRES, name)[0]
-    if kind == ".npy":
-        values = read_npy(file, name, KINDS)
-    else:
-        values = {".pfm": read_pfm, ".ply": read_ply_points}.get(kind, _table)(file, name)
-    if values.ndim != 2 or 0 in values.shape:
-        bad_value(name, "a map (H, W) or points (N, 3) of numbers", f"{file} of shape {values.shape}")
-    if values.shape[1] in COLUMNS:
-        values = values[:, :3]
-    if scale is None:
-        check_metres(values, name, f"{file} of {values.dtype}")
-    with np.errstate(over="ignore"):
-        values = (values / (scale or 1.0)).astype(np.float32)
-    return values if values.shape[1] == 3 else np.where(np.isfinite(values), values, np.float32(0))
+    values = read_map_file(path, name)
+    known = np.isfinite(values) & ((values > 0) | (Path(path).suffix.lower() not in PICTURES))
+    return np.where(known, values.astype(np.float32) if values.dtype.kind in "iu" else values, np.nan)
 
 
 def read_confidence(path: PathLike, name: str = "points_confidence") -> np.ndarray:
@@ -166,41 +122,6 @@ def read_confidence(path: PathLike, name: str = "points_confidence") -> np.ndarr
         return (values / np.iinfo(values.dtype).max).astype(np.float32)
     values = read_pfm(file, name) if kind == ".pfm" else read_npy(file, name, "numbers in [0, 1] as .npy")
     return np.squeeze(values).astype(np.float32)
-
-
-def _table(path: Path, name: str) -> np.ndarray:
-    """Numbers of a text, one row a line, below one heading at most."""
-    rows = read_rows(path, name, KINDS)
-    heading = rows.pop(0) if rows and not NUMBER.fullmatch(rows[0][0]) else []
-    lengths = {len(row) for row in rows}
-    if lengths == {len(heading)}:  # a word a column
-        words = [re.sub(r"([_ ]?m|[_ ]?[\[(]m[\])])$", "", word.lower()) for word in heading]
-        if any(words.count(axis) != 1 for axis in "xyz"):
-            cure = "Write the points as x, y and z of the left camera, or depths as a map of the left image."
-            got = f"{path} with {', '.join(heading)}"
-            bad_value(name, "points with columns x, y and z, in metres", got, cure)
-        rows = [[row[words.index(axis)] for axis in "xyz"] for row in rows]
-    with suppress(ValueError):  # words, or rows of several lengths
-        return np.array(rows, dtype=np.float64).reshape(len(rows), -1)
-    got = f"{path} with words, or rows of {sorted(lengths)} numbers"
-    bad_value(name, "points in metres, one a line, below one heading at most", got)
-
-
-def read_ply_points(path: Path, name: str = "points") -> np.ndarray:
-    """The points ``(N, 3)`` float64 of a PLY file, ASCII or binary, in the file's unit and frame."""
-    import trimesh
-
-    count = re.search(rb"\nelement vertex (\d+)\s", path.read_bytes())
-    try:
-        how: dict[str, Any] = {"process": False, "skip_materials": True, "fix_texture": False}
-        cloud: Any = trimesh.load(path, file_type="ply", **how)
-        points = np.array(cloud.vertices, np.float64)
-    except Exception:  # of any kind that a damaged file leads to
-        points = np.empty((0, 3))
-    if count is None or not 0 < int(count.group(1)) == len(points):
-        expected = "a whole PLY file whose vertices have x, y and z"
-        bad_value(name, expected, path, "Is it cut off, or another format?")
-    return points
 
 
 def _baseline(E: np.ndarray, name: str, got: str) -> float:
@@ -223,17 +144,47 @@ def disparity_of_depth(
     return (shift * inverse - (K_right[0, 2] - K_left[0, 2])).astype(np.float32)
 
 
+def _units_per_px(path: PathLike, per_px: float | None, name: str) -> float:
+    """``per_px``, or what the kind of file says; whole numbers that are no PNG say nothing."""
+    if per_px is not None:
+        return float(check_number(per_px, f"{name}: units per pixel", 1e-9, 1e9))
+    if Path(path).suffix.lower() == ".png":
+        return KITTI_UNITS
+    kind = read_map_file(path, name).dtype
+    if kind.kind in "iu":
+        cure = "Those of OpenCV's StereoBM and StereoSGBM are 16 times the disparity: give --points-scale 16."
+        bad_value(name, "in pixels as floats", f"{path} of {kind}", cure)
+    return 1.0
+
+
+def _check_sign(disparity: np.ndarray, name: str, path: PathLike) -> None:
+    """Refuse disparities of which most are negative; a few mark what is unknown."""
+    known = disparity[np.isfinite(disparity) & (disparity != 0)]
+    if len(known) and (known < 0).mean() > MOST_NEGATIVE:
+        expected = "above 0: the column in the left image minus that in the right one"
+        cure = "Right minus left, as ZED's, is the negative of it: save -disparity."
+        bad_value(name, expected, f"{path} from {known.min():.4g} to {known.max():.4g}", cure)
+
+
 def depth_of_disparity(
-    path: PathLike, rig: Rig, size: tuple[int, int], name: str = "disparity"
+    path: PathLike,
+    rig: Rig,
+    size: tuple[int, int],
+    name: str = "disparity",
+    *,
+    per_px: float | None = None,
 ) -> np.ndarray:
     """Depths ``(H, W)``, metres, ``fx baseline / (d + doffs)``, of a disparity map; 0 where unknown.
 
-    The map may be one of the image scaled; ``rig`` is rectified, its K for images of ``size``.
+    A disparity is a left column minus that of the same point in the right image. ``per_px`` is how many units
+    of the file a pixel has: 256 for KITTI's PNG, the default for one, 16 for OpenCV's matchers. The map may
+    be one of the image scaled; ``rig`` is rectified, its K for images of ``size``.
     """
     baseline_m = _baseline(rig.E, name, f"the rig of {rig.source}")
     if rig.unit is None:
         bad_value(name, "of a rig in metres", f"the rig of {rig.source}, which has no unit")
-    values = read_map(path, name) / (KITTI_UNITS if Path(path).suffix.lower() == ".png" else 1.0)
+    values = read_map(path, name) / _units_per_px(path, per_px, name)
+    _check_sign(values, name, path)
     (width, height), (rows, columns) = size, values.shape
     scale = width / columns
     if abs(height / (scale * rows) - 1.0) > 0.02:
@@ -244,4 +195,5 @@ def depth_of_disparity(
     shift = disparity + rig.K_right[0, 2] - rig.K_left[0, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         depth_m = rig.K_left[0, 0] * baseline_m / shift
-    return np.where(np.isfinite(depth_m) & (shift > 0) & (disparity != 0), depth_m, 0.0).astype(np.float32)
+    known = np.isfinite(depth_m) & (shift > 0) & (disparity != 0)
+    return np.where(known, depth_m, 0.0).astype(np.float32)

@@ -23,6 +23,8 @@ if TYPE_CHECKING:  # what is wrong with a file is said before numpy is imported
 PathLike = str | os.PathLike[str]
 #: EXIF's tag of how an image is turned or mirrored; from 5 on its sides change places.
 ORIENTATION = 0x0112
+#: Its values that change anything.
+TURNS = range(2, 9)
 #: A number whose decimals follow a comma, alone between blanks, semicolons or the ends of a line.
 DECIMAL_COMMA = re.compile(r"(?<![^\s;])[-+]?\d+,\d+(e[-+]?\d+)?(?![^\s;])", re.IGNORECASE)
 #: No calibration file is near this size; a larger one is something else.
@@ -93,12 +95,24 @@ def natural_order(path: Path) -> tuple[list[str | int], str]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
 
+def stored_size(path: PathLike, name: str) -> tuple[int, int]:
+    """``(width, height)`` of an image file as it stores its pixels."""
+    with open_image(path, name) as image:
+        return image.size
+
+
 def upright_size(path: PathLike, name: str) -> tuple[int, int]:
-    """``(width, height)`` of an image file as it is read, turned by its EXIF orientation."""
+    """``(width, height)`` of an image file as it is shown, turned by its EXIF orientation."""
     with open_image(path, name) as image:
         width, height = image.size
         turned = image.getexif().get(ORIENTATION, 1) >= 5
     return (height, width) if turned else (width, height)
+
+
+def is_turned(path: PathLike, name: str = "the image") -> bool:
+    """Whether an image file is shown turned or mirrored, by its EXIF orientation."""
+    with open_image(path, name) as image:
+        return image.getexif().get(ORIENTATION) in TURNS
 
 
 def read_text(path: PathLike, name: str, what: str = "a text file") -> str:

@@ -1,21 +1,19 @@
-"""Images from files and memory as floats in [0, 1] (S3.3, the two views); their EXIF data; their lenses."""
+"""Images from files and memory as floats in [0, 1] (S3.3, the two views), and their EXIF data."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from geodiff_plugin._checks import InputError, bad_type, bad_value, check_number, warn
-from geodiff_plugin.formats.files import ORIENTATION, PathLike, open_image
-from geodiff_plugin.formats.rigs import COEFFICIENT_COUNTS, intrinsics
+from geodiff_plugin.formats.files import ORIENTATION, TURNS, PathLike, open_image
+from geodiff_plugin.formats.rigs import intrinsics
 from geodiff_plugin.messages import Message
-from geodiff_plugin.types import Distortion
 
 #: Fewer pixels a side hold no matches; also the VAE's smallest sensible latent.
 MIN_SIDE = 32
@@ -25,7 +23,7 @@ OVERSHOOT = 1e-3
 DARK_16_BITS = 8192
 #: Formats that hold several frames or pages of one kind; others hold previews.
 SEVERAL = ("GIF", "PNG", "TIFF", "WEBP")
-TURNS, CHANNELS = range(2, 9), (1, 3, 4)
+CHANNELS = (1, 3, 4)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _DIAGONAL_35_MM = math.hypot(36.0, 24.0)
 #: A focal length further off its EXIF than this factor is of an image of another size: EXIF is known to a few
@@ -34,8 +32,6 @@ _OTHER_LENS = 1.4
 #: Sides may be rounded by this share before an image counts as cropped.
 _SAME_SHAPE = 0.01
 CURES = "Give K (--K), a field of view (--fov), or photographs with their EXIF."
-#: When OpenCV's search for a ray ends, and how near to its pixel a ray that was found comes back.
-UNTIL, TOLERANCE_PX = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-9), 0.01
 
 
 def _check_sides(width: int, height: int, name: str) -> None:
@@ -99,15 +95,21 @@ def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[Message]]:
     return np.repeat(value, 3, axis=-1) if value.shape[-1] == 1 else value, notes
 
 
-def read_image(path: PathLike, name: str = "left") -> tuple[np.ndarray, list[Message]]:
-    """An image file, upright, ``(H, W, 3)`` float32 in [0, 1], and what was done to it."""
+def read_image(
+    path: PathLike, name: str = "left", *, as_stored: bool = False
+) -> tuple[np.ndarray, list[Message]]:
+    """An image file, ``(H, W, 3)`` float32 in [0, 1], and sentences about what was done to it.
+
+    It is turned upright by its EXIF orientation, unless its camera is one of the pixels ``as_stored``.
+    """
     with open_image(path, name) as image:
         notes = _file_notes(image, name)
         image.seek(0)
         image.load()
-        is_turned = image.getexif().get(ORIENTATION) in TURNS
-        upright = ImageOps.exif_transpose(image)
-    image_01, more = _to_01(_array_of(upright, name), name)
+        is_turned = image.getexif().get(ORIENTATION) in TURNS and not as_stored
+        upright = ImageOps.exif_transpose(image) if is_turned else image
+        pixels = _array_of(upright, name)
+    image_01, more = _to_01(pixels, name)
     notes += more
     if is_turned:
         said = f"{name} was turned or mirrored to {upright.width}x{upright.height}, as its EXIF says"
@@ -174,12 +176,17 @@ def intrinsics_from_fov(fov_deg: float, size: tuple[int, int]) -> np.ndarray:
     return intrinsics(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
 
 
-def intrinsics_from_exif(source: PathLike | Image.Image, name: str) -> tuple[np.ndarray, list[Message]]:
-    """K of a photograph to a few per cent, of a file upright, of an image as it lies; what was assumed."""
+def intrinsics_from_exif(
+    source: PathLike | Image.Image, name: str, *, as_stored: bool = False
+) -> tuple[np.ndarray, list[Message]]:
+    """K of a photograph to a few per cent, and what was assumed.
+
+    A file's is that of the upright image, unless it is to be read ``as_stored``; an image's as it lies.
+    """
     if not isinstance(source, Image.Image):
         with open_image(source, name) as image:
             K, notes = intrinsics_from_exif(image, name)
-            turned = image.getexif().get(ORIENTATION, 1) >= 5
+            turned = image.getexif().get(ORIENTATION, 1) >= 5 and not as_stored
         return intrinsics(K[1, 1], K[0, 0], K[1, 2], K[0, 2]) if turned else K, notes
     entries = source.getexif().get_ifd(IFD.Exif)
 
@@ -230,54 +237,3 @@ def warn_of_other_lens(source: PathLike | Image.Image, K: np.ndarray, name: str)
         cure = "If it is, all metres are off by that factor."
         sentence = f"K has a focal length of {K[0, 0]:.0f} px for {name}, {said} {cure}"
         warn(Message("camera.other-lens", sentence), stacklevel=3)
-
-
-def distortion_from_text(text: str, name: str = "--distortion") -> Distortion:
-    """Coefficients as they are typed: ``k1,k2,p1,p2[,k3...]``, or ``fisheye:k1,k2,k3,k4``."""
-    model, colon, numbers = text.rpartition(":")
-    model = model if colon else "opencv"
-    try:
-        coefficients = np.array(numbers.split(","), dtype=np.float64)
-    except ValueError:
-        coefficients = np.zeros(0)
-    if len(coefficients) not in COEFFICIENT_COUNTS.get(model, ()) or not np.isfinite(coefficients).all():
-        cure = "The order is OpenCV's: k1,k2,p1,p2,k3."
-        bad_value(name, "k1,k2,p1,p2[,k3[,...]] or fisheye:k1,k2,k3,k4", repr(text), cure)
-    return Distortion(model, coefficients)
-
-
-def undistorted(image_01: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
-    """The image ``(H, W, 3)`` in [0, 1] of a pinhole camera with the same K and size; black without a ray."""
-    coefficients, K = np.asarray(distortion.coefficients, np.float64), np.asarray(K, np.float64)
-    if distortion.model == "fisheye":
-        straight = cv2.fisheye.undistortImage(image_01, K, coefficients, Knew=K)
-    else:
-        straight = cv2.undistort(image_01, K, coefficients)
-    return straight.clip(0.0, 1.0).astype(np.float32)
-
-
-def undistorted_pixels(pixels: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
-    """Where pixels ``(N, 2)`` of the image as taken lie in that of ``undistorted``; NaN without a ray."""
-    taken, K = np.asarray(pixels, np.float64).reshape(-1, 1, 2), np.asarray(K, np.float64)
-    if not len(taken):
-        return taken[:, 0]
-    coefficients, none = np.asarray(distortion.coefficients, np.float64), np.zeros(3)
-    if distortion.model == "fisheye":
-        straight = cv2.fisheye.undistortPoints(taken, K, coefficients, R=np.eye(3), P=K, criteria=UNTIL)
-        rays = cv2.convertPointsToHomogeneous(straight) @ np.linalg.inv(K).T
-        back = cv2.fisheye.distortPoints(rays[..., :2], K, coefficients)
-    else:
-        straight = cv2.undistortImagePoints(taken, K, coefficients, None, UNTIL)
-        rays = cv2.convertPointsToHomogeneous(straight) @ np.linalg.inv(K).T
-        back = cv2.projectPoints(rays, none, none, K, coefficients)[0]
-    inverted = np.abs(back - taken).max(axis=2) < TOLERANCE_PX
-    return np.where(inverted, straight[:, 0], np.nan)
-
-
-def undistorted_points(depth_m: np.ndarray, K: np.ndarray, distortion: Distortion) -> np.ndarray:
-    """Known depths ``(H, W)`` metres of an image as taken as points ``(N, 3)`` of the camera, unmixed."""
-    rows, columns = np.nonzero(np.isfinite(depth_m) & (depth_m > 0))
-    straight = undistorted_pixels(np.stack([columns, rows], axis=1), K, distortion)
-    rays = np.concatenate([straight, np.ones((len(straight), 1))], axis=1) @ np.linalg.inv(K).T
-    points = rays * depth_m[rows, columns, None]
-    return points[np.isfinite(points).all(axis=1)].astype(np.float32)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin._checks import bad_type, bad_value, check_number, warn
-from geodiff_plugin.formats import sfm, stereo
+from geodiff_plugin.formats import colmap, stereo, transforms
 from geodiff_plugin.formats.files import PathLike
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
 from geodiff_plugin.messages import Message
@@ -43,7 +43,8 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         "OAK-D JSON (cameraData)", _JSON + r'(?=[\s\S]*"cameraData")', stereo.read_oak, uses_cameras=True),
     "nerf": CalibrationFormat(
         "transforms.json of nerfstudio or instant-ngp (frames, transform_matrix)",
-        _JSON + r'(?=[\s\S]*"frames")(?=[\s\S]*"transform_matrix")', sfm.read_nerf, by_image=True),
+        _JSON + r'(?=[\s\S]*"frames")(?=[\s\S]*"transform_matrix")', transforms.read_nerf, by_image=True,
+        as_stored=True),
     "kalibr": CalibrationFormat(
         "Kalibr camchain.yaml (cam0)", r"^cam\d+:\s*(?:#.*)?$", stereo.read_kalibr, uses_cameras=True),
     "euroc": CalibrationFormat("pair of EuRoC sensor.yaml (T_BS)", r"^T_BS\s*:", stereo.read_euroc, (2,)),
@@ -60,7 +61,8 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "stereodemo": CalibrationFormat(
         "stereodemo JSON (fx)", _JSON + r'(?=[\s\S]*"fx")', stereo.read_stereodemo),
     "colmap": CalibrationFormat(
-        "COLMAP model (cameras.txt and images.txt)", sfm.MARK, sfm.read_colmap, (2,), by_image=True),
+        "COLMAP model (cameras.txt and images.txt)", colmap.MARK, colmap.read_colmap, (2,), by_image=True,
+        as_stored=True),
 }  # fmt: skip
 
 
@@ -70,8 +72,8 @@ def _texts(path: PathLike | Sequence[PathLike]) -> dict[Path, str]:
     if not isinstance(paths, (tuple, list)) or not all(isinstance(p, (str, os.PathLike)) for p in paths):
         bad_type("calibration", "a path, or a pair of paths (left, right)", path)
     if len(paths) == 1 and os.path.isdir(paths[0]):
-        paths = sfm.model_files(Path(paths[0])) or paths
-    return {Path(file): sfm.calibration_text(file) for file in paths}
+        paths = colmap.model_files(Path(paths[0])) or paths
+    return {Path(file): colmap.calibration_text(file) for file in paths}
 
 
 def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
@@ -159,6 +161,11 @@ def read_calibration(
             name = f"Lens distortion of the {side} camera in {source}"
             bad_value(name, "zero (images of a pinhole camera)", got, cure)
     return _in_metres(rig, baseline_m, entry.by_image)
+
+
+def is_as_stored(path: PathLike | Sequence[PathLike]) -> bool:
+    """Whether a calibration's cameras are those of the pixels as files store them, not as EXIF turns them."""
+    return _format_of(_texts(path)).as_stored
 
 
 def has_pose_per_image(path: PathLike | Sequence[PathLike]) -> bool:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import PurePath
 from typing import Any, TypeVar
 
@@ -26,10 +27,21 @@ RATIO_TOLERANCE = 0.01
 LENS_MODELS = {
     **{"": "opencv", "cameratype 0": "opencv", "cameratype 1": "fisheye"},
     **dict.fromkeys("opencv pinhole simple_pinhole none brownconrady".split(), "opencv"),
+    **dict.fromkeys("full_opencv simple_radial radial perspective".split(), "opencv"),
     **dict.fromkeys("radtan radial-tangential plumb_bob rational_polynomial".split(), "opencv"),
     **dict.fromkeys("fisheye opencv_fisheye equidistant kannalabrandt4 kannalabrandt8".split(), "fisheye"),
+    **dict.fromkeys("simple_fisheye simple_radial_fisheye radial_fisheye".split(), "fisheye"),
 }
 COEFFICIENT_COUNTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
+#: Models of COLMAP that OpenCV does not have, and how many coefficients each has; pycolmap removes them.
+COLMAP_LENSES = {
+    "FOV": 1,
+    "THIN_PRISM_FISHEYE": 8,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 12,
+    "SIMPLE_DIVISION": 1,
+    "DIVISION": 1,
+    "EUCM": 2,
+}
 CHECK_FILE = "Check the calibration file."
 
 
@@ -63,7 +75,8 @@ class CalibrationFormat:
     ``mark`` is a regular expression that its texts have, and none of a format before it; ``^`` begins a line.
     ``read`` makes the rig of the texts by ``make_rig``, and may raise whatever a missing entry raises. Files
     may be as many as ``file_counts`` says, hold more than two cameras (``uses_cameras``), or a pose in no
-    known unit for each of many images (``by_image``).
+    known unit for each of many images (``by_image``), or cameras of the pixels as image files store them, not
+    as EXIF turns them (``as_stored``).
     """
 
     summary: str
@@ -72,6 +85,7 @@ class CalibrationFormat:
     file_counts: tuple[int, ...] = (1,)
     uses_cameras: bool = False
     by_image: bool = False
+    as_stored: bool = False
 
 
 @contextmanager
@@ -189,14 +203,16 @@ def _parts_in_common(name: str, wanted: str) -> int:
 
 
 def is_distorted(lens: Distortion | None) -> bool:
-    """Whether a lens moves any pixel; a fisheye does with coefficients of zero as well."""
+    """Whether a lens moves any pixel; others than OpenCV's first do with coefficients of zero as well."""
     if lens is None:
         return False
-    return lens.model == "fisheye" or np.abs(lens.coefficients).max(initial=0.0) > DISTORTION_TOLERANCE
+    return lens.model != "opencv" or np.abs(lens.coefficients).max(initial=0.0) > DISTORTION_TOLERANCE
 
 
 def lens_of(camera: Camera, name: str) -> Distortion | None:
     """The lens of a camera, which messages name; ``None`` where it moves no pixel."""
+    if camera.model in COLMAP_LENSES:
+        return _colmap_lens(camera, name)
     model = LENS_MODELS.get(camera.model.lower(), "")
     if not model:
         cure = "OpenCV does not have this model: undistort or rectify both images to a pinhole first."
@@ -212,6 +228,15 @@ def lens_of(camera: Camera, name: str) -> Distortion | None:
         expected = f"{', '.join(map(str, counts))} coefficients in OpenCV's order ({model})"
         bad_value(f"the lens distortion of {name}", expected, numbers.tolist(), CHECK_FILE)
     return lens
+
+
+def _colmap_lens(camera: Camera, name: str) -> Distortion:
+    """The lens of a model that only pycolmap has."""
+    if find_spec("pycolmap") is None:
+        cure = "Run: pip install pycolmap, or undistort the images first (colmap image_undistorter)."
+        bad_value(f"the lens model of {name}", "opencv or fisheye without pycolmap", camera.model, cure)
+    count = COLMAP_LENSES[camera.model]
+    return Distortion(camera.model, array_of(camera.coefficients, (count,), f"the lens distortion of {name}"))
 
 
 def _pixels(size: Any, name: str) -> Size | None:

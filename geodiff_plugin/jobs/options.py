@@ -74,7 +74,7 @@ class DepthOptions(RunOptions):
     cropped: bool = _camera(False, "The principal point may lie outside: the images are crops.")
     prior_map: Path | None = declare(None, "Another model's map of LEFT (or folder of maps) as the prior.")
     points: Path | None = declare(None, "Known depths: a map of LEFT, or points (.npy, text, .ply).")
-    points_scale: float | None = declare(None, "Units per metre: 1000 for mm.", above_0="units per metre")
+    points_scale: float | None = declare(None, "Units per metre, of --disparity per pixel.", above_0="units")
     disparity: Path | None = declare(None, "Disparities of LEFT in a rectified rig, instead of --points.")
     points_confidence: Path | None = declare(None, "Confidence of each known depth, [0, 1], same shape.")
     topic_left: str | None = declare(None, "Topic of the left images, where LEFT is a bag.", "--left")
@@ -181,7 +181,7 @@ class DepthOptions(RunOptions):
             (not posed, "calib cameras e view_e cx_right", "left out with --estimate-pose", "both", known),
             (not posed, "steady", "left out with --estimate-pose", "both", "Each pair has its scale."),
             (not self.calib, "cameras", *of_file),
-            (no_points, "points_scale", "given with --points", "no --points", ""),
+            (no_points and no_disparity, "points_scale", *of_depths),
             (not no_points, "disparity", "given in place of --points", "both", ""),
             (no_points and no_disparity, "points_confidence", *of_depths),
             (alone and no_disparity, "baseline cx_right", *second),

@@ -21,18 +21,17 @@ from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.guidance import GeometryGuidance, assume_same_centre
 from geodiff_plugin.evidence.prepare import cleaned
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
+from geodiff_plugin.formats.colmap import check_colmap_names
 from geodiff_plugin.formats.depth import depth_of_disparity, read_confidence, read_map
-from geodiff_plugin.formats.images import (
+from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov, warn_of_other_lens
+from geodiff_plugin.formats.lenses import (
     distortion_from_text,
-    intrinsics_from_exif,
-    intrinsics_from_fov,
     undistorted,
     undistorted_pixels,
     undistorted_points,
-    warn_of_other_lens,
 )
+from geodiff_plugin.formats.reading import is_as_stored
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
-from geodiff_plugin.formats.sfm import check_colmap_names
 from geodiff_plugin.jobs.options import PARAMETERS, DepthOptions, told_apart
 from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Distortion, Rig
@@ -80,7 +79,8 @@ def read_pair(
         InputError: a file that cannot be read, or cameras that do not fit the images.
     """
     views, config = options.photographs(), options.config()
-    images = list(frames or map(_read_view, views.values(), views))
+    as_stored = bool(options.calib) and is_as_stored(options.calib)
+    images = list(frames or (_read_view(path, name, as_stored) for name, path in views.items()))
     sizes = [(image.shape[1], image.shape[0]) for image in images]
     if options.estimate_pose:
         cameras = _cameras_without_poses(options, sizes)
@@ -146,8 +146,9 @@ def _posed_guidance(
     return guidance
 
 
-def _read_view(path: Path, name: str) -> np.ndarray:
-    image, notes = read_image(path, name if name in ("LEFT", "RIGHT") else f"--view {path}")
+def _read_view(path: Path, name: str, as_stored: bool) -> np.ndarray:
+    called = name if name in ("LEFT", "RIGHT") else f"--view {path}"
+    image, notes = read_image(path, called, as_stored=as_stored)
     for note in notes:
         warn(note)
     return image
@@ -232,7 +233,8 @@ def _read_known(
     if options.disparity is not None:
         if rig is None:
             bad_value("--disparity", "of a rectified rig with a calibration", "--estimate-pose")
-        return depth_of_disparity(options.disparity, rig, size, "--disparity")
+        per_px = options.points_scale
+        return depth_of_disparity(options.disparity, rig, size, "--disparity", per_px=per_px)
     if options.points is None:
         return None
     known = read_points(options.points, "--points", scale=options.points_scale)

@@ -10,7 +10,7 @@ from PIL import Image
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.formats.images import distortion_from_text
+from geodiff_plugin.formats.lenses import distortion_from_text
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.reading import lenses_of, read_pair
 from geodiff_plugin.types import Rig

@@ -11,7 +11,7 @@ from PIL import Image
 from geodiff_plugin import plotting
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
 from geodiff_plugin.formats import read_calibration
-from geodiff_plugin.formats.images import distortion_from_text, undistorted
+from geodiff_plugin.formats.lenses import distortion_from_text, undistorted
 from tests.cli.conftest import QUICK, report_of
 
 LENS = "-0.2,0.05,0,0"

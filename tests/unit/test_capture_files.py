@@ -13,7 +13,10 @@ from geodiff_plugin import InputError
 from geodiff_plugin.capture.capture import Capture
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.clouds import Cloud
-from geodiff_plugin.formats.sfm import write_colmap
+from geodiff_plugin.formats.colmap import MODELS, write_colmap
+from geodiff_plugin.formats.lenses import undistorted_pixels
+from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.jobs.reading import read_pair
 from tests.unit.capture_room import SIZE, K, render, walk, write_transforms
 
 TRUE = walk(4)
@@ -144,10 +147,6 @@ def test_units_and_lenses_of_transforms(tmp_path):
     assert capture.frames[0].depth == folder / "depth/f00.png"
 
 
-def crop(folder: Path, data: dict) -> None:
-    Image.fromarray(IMAGES[0][:90]).save(folder / "images/f00.png")
-
-
 def lose(folder: Path, data: dict) -> None:
     for i in range(3):
         (folder / f"images/f{i:02d}.png").unlink()
@@ -158,10 +157,7 @@ def lose(folder: Path, data: dict) -> None:
     [
         (lose, "at least two frames"),
         (lambda _, data: [data.pop(key) for key in ("fl_x", "fl_y")], "fl_x"),
-        (lambda _, data: data["frames"][1].update(transform_matrix=[[1, 2]]), "transform_matrix"),
-        (lambda _, data: data["frames"][1].pop("transform_matrix"), "no 'transform_matrix'"),
-        (lambda folder, _: (folder / "images/f00.png").write_bytes(b"?"), "f00.png must be an image file"),
-        (crop, "crop"),
+        (lambda _, data: data.pop("frames"), "no 'frames'"),
     ],
 )
 def test_bad_captures_get_a_sentence(change, words, tmp_path):
@@ -171,6 +167,44 @@ def test_bad_captures_get_a_sentence(change, words, tmp_path):
     (folder / "transforms.json").write_text(json.dumps(data))
     with pytest.raises(InputError, match=words):
         Capture.open(folder)
+
+
+def crop(folder: Path, frame: dict) -> None:
+    Image.fromarray(IMAGES[1][:90]).save(folder / "images/f01.png")
+
+
+def scaled(_: Path, frame: dict) -> None:
+    """The same pose as a homogeneous matrix whose last number is 2."""
+    frame["transform_matrix"] = (2 * np.array(frame["transform_matrix"])).tolist()
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (
+            lambda _, frame: frame.update(transform_matrix=[[1, 2]]),
+            "transform_matrix must be 16 finite numbers",
+        ),
+        (lambda _, frame: frame.update(transform_matrix=None), "no pose"),
+        (lambda _, frame: frame["transform_matrix"].__setitem__(0, [float("nan")] * 4), "no pose"),
+        (lambda _, frame: frame.pop("transform_matrix"), "no pose"),
+        (lambda _, frame: frame.update(camera_model="EQUIRECTANGULAR"), "got EQUIRECTANGULAR"),
+        (lambda _, frame: frame.update(w="wide"), "entries do not read"),
+        (lambda _, frame: frame.update(file_path="images/f00.png"), "named twice"),
+        (lambda folder, _: (folder / "images/f01.png").write_bytes(b"?"), "f01.png must be an image file"),
+        (crop, "crop"),
+        (scaled, ""),
+    ],
+)
+def test_what_is_wrong_with_a_frame_leaves_out_that_frame_alone(change, why, tmp_path):
+    folder = write_transforms(tmp_path, TRUE, TRUE)
+    data = json.loads((folder / "transforms.json").read_text())
+    change(folder, data["frames"][1])
+    (folder / "transforms.json").write_text(json.dumps(data))
+    capture = Capture.open(folder)
+    assert capture.names == ["f00", *["f01"] * (not why), "f02", "f03"]
+    np.testing.assert_allclose(capture.frames[-1].E, TRUE[3], atol=1e-6)
+    assert (why in capture.notes[0] and "1 skipped" in capture.notes[0]) if why else not capture.notes
 
 
 def test_missing_images_and_lost_poses_are_named(tmp_path):
@@ -187,3 +221,256 @@ def test_missing_images_and_lost_poses_are_named(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="none of these"):
         Capture.open(tmp_path / "empty")
+
+
+ORIENTATION = 0x0112
+TURNED = pytest.mark.parametrize("orientation", [3, 6, 8])
+
+
+def turn(image: Path, orientation: int) -> None:
+    """Say in an image's EXIF data that it is shown turned; its pixels stay as they are."""
+    exif = Image.Exif()
+    exif[ORIENTATION] = orientation
+    with Image.open(image) as opened:
+        opened.save(image, exif=exif)
+
+
+@TURNED
+@pytest.mark.parametrize("write", [transforms, colmap_text], ids=lambda write: write.__name__)
+def test_cameras_of_stored_pixels_leave_images_as_they_are_stored(write, orientation, tmp_path):
+    folder = write(tmp_path / "scan")
+    for image in (folder / "images").iterdir():
+        turn(image, orientation)
+    capture = Capture.open(folder)
+    assert "f00, f01, f02, f03: their EXIF data say" in capture.notes[0] and len(capture.notes) == 1
+    for frame, E, image in zip(capture.frames, TRUE, IMAGES, strict=True):
+        np.testing.assert_allclose(frame.E, E, atol=1e-6)
+        np.testing.assert_allclose(frame.K, K, atol=1e-9)
+        assert frame.size == SIZE
+        np.testing.assert_allclose(capture.image(frame.name), image / 255, atol=1e-6)
+    if write is transforms:
+        depth, known = capture.measured_depth("f02")
+        np.testing.assert_allclose(depth, render(TRUE[2])[1], atol=1e-3)
+        assert known.all()
+
+
+@pytest.mark.parametrize("orientation", [6, 8])
+def test_a_camera_whose_size_is_that_of_the_turned_image_turns_it(orientation, tmp_path):
+    """An exporter that turned the pixels' camera but not the pixels: the sizes leave no doubt."""
+    folder = write_transforms(tmp_path, TRUE, TRUE, w=SIZE[1], h=SIZE[0], cx=90.5, cy=120.5)
+    for image in (folder / "images").iterdir():
+        turn(image, orientation)
+    capture = Capture.open(folder)
+    assert not capture.notes and capture.frames[0].size == SIZE[::-1]
+    quarter = {6: -1, 8: 1}[orientation]
+    np.testing.assert_allclose(capture.image("f01"), np.rot90(IMAGES[1], quarter) / 255, atol=1e-6)
+
+
+@TURNED
+def test_photographs_without_cameras_are_taken_as_they_are_shown(orientation, tmp_path):
+    for i, image in enumerate(IMAGES):
+        save(tmp_path / f"i{i}.png", image)
+        turn(tmp_path / f"i{i}.png", orientation)
+    capture = Capture.open(tmp_path, fov=60.0)
+    shown = np.rot90(IMAGES[0], {3: 2, 6: -1, 8: 1}[orientation])
+    assert capture.frames[0].size == shown.shape[1::-1] and not capture.notes
+    np.testing.assert_allclose(capture.image("i0"), shown / 255, atol=1e-6)
+
+
+@TURNED
+def test_a_pair_of_a_colmap_model_is_read_as_it_is_stored(orientation, tmp_path):
+    folder = colmap_text(tmp_path)
+    for image in (folder / "images").iterdir():
+        turn(image, orientation)
+    left, right = (folder / "images" / f"f0{i}.png" for i in (0, 3))
+    options = DepthOptions(left=left, right=right, calib=(folder / "sparse" / "0",), baseline=0.33)
+    inputs = read_pair(options)
+    np.testing.assert_allclose(inputs.left, IMAGES[0] / 255, atol=1e-6)
+    np.testing.assert_allclose(inputs.rig.K_left, K)
+
+
+def test_images_of_one_name_in_two_folders_stay_apart(tmp_path):
+    folder = write_transforms(tmp_path, TRUE, TRUE)
+    data = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(data["frames"]):
+        frame["file_path"] = f"{'ab'[i // 2]}/rgb/{i % 2}.png"
+        save(folder / frame["file_path"], IMAGES[i])
+    (folder / "transforms.json").write_text(json.dumps(data))
+    capture = Capture.open(folder)
+    assert capture.names == ["a-rgb-0", "a-rgb-1", "b-rgb-0", "b-rgb-1"]
+    for name, image in zip(capture.names, IMAGES, strict=True):
+        np.testing.assert_allclose(capture.image(name), image / 255, atol=1e-6)
+    (folder / "b/rgb/1.png").unlink()  # a file of this name in another folder is not taken for it
+    assert Capture.open(folder).names == ["a-rgb-0", "a-rgb-1", "b-rgb-0"]
+
+
+def test_the_largest_of_several_models_is_taken_and_said(tmp_path):
+    folder = colmap_text(tmp_path)
+    (folder / "sparse" / "1").mkdir()
+    for name in ("cameras.txt", "images.txt", "points3D.txt"):
+        text = (folder / "sparse" / "0" / name).read_text()
+        (folder / "sparse" / "1" / name).write_text(text)
+        if name == "images.txt":
+            (folder / "sparse" / "0" / name).write_text("\n".join(text.splitlines()[:5]))
+    capture = Capture.open(folder)
+    assert len(capture) == 4
+    assert capture.notes == [
+        "sparse/1, with 4 images, is used, the largest of 2 models; left out: sparse/0 with 2. "
+        "To take another, give its folder."
+    ]
+    assert len(Capture.open(folder / "sparse" / "0")) == 2
+
+
+DEPTH_KINDS = [
+    ("png", {}, 1000, np.uint16),
+    ("png", {"depth_unit_scale_factor": 1 / 256}, 256, np.uint16),
+    ("png", {"integer_depth_scale": 10 / 65535}, 6553.5, np.uint16),
+    ("npy", {}, 1, np.float32),
+    ("npy", {}, 1000, np.uint16),
+    ("npy", {"depth_unit_scale_factor": 1e-3}, 1000, np.float32),
+    ("tiff", {}, 1, np.float32),
+    ("exr", {}, 1, np.float32),
+]
+
+
+@pytest.mark.parametrize("key", ["depth_file_path", "depth_path", None])
+@pytest.mark.parametrize(("suffix", "more", "per_m", "kind"), DEPTH_KINDS)
+def test_depth_maps_of_every_kind_and_unit(suffix, more, per_m, kind, key, tmp_path):
+    folder = write_transforms(tmp_path, TRUE, TRUE, **more)
+    depth = render(TRUE[1])[1] * per_m
+    depth = np.rint(depth).astype(kind) if np.issubdtype(kind, np.integer) else depth.astype(kind)
+    for file in (folder / "depth").iterdir():
+        file.unlink()
+    path = folder / "depth" / f"f01.{suffix}"
+    if suffix == "npy":
+        np.save(path, depth)
+    elif suffix == "exr":
+        exr = pytest.importorskip("OpenEXR")
+        exr.File({"compression": exr.ZIP_COMPRESSION}, {"Y": depth}).write(str(path))
+    else:
+        Image.fromarray(depth).save(path)
+    data = json.loads((folder / "transforms.json").read_text())
+    for frame in data["frames"]:
+        del frame["depth_file_path"]
+        if key:
+            frame[key] = f"depth\\f01.{suffix}"  # as programs of Windows write it
+    (folder / "transforms.json").write_text(json.dumps(data))
+    read, known = Capture.open(folder).measured_depth("f01")
+    np.testing.assert_allclose(read, render(TRUE[1])[1], atol=0.6 / per_m if per_m > 1 else 1e-5)
+    assert known.all()
+
+
+FILE_PATHS = {
+    "C:\\Users\\me\\scan\\images\\f0{}.png": "transforms.json",
+    "/home/me/scan/images/f0{}.png": "transforms.json",
+    "images\\f0{}.png": "transforms.json",
+    "./images/f0{}": "transforms.json",
+    "images/f0{}.JPG": "transforms_train.json",
+}
+
+
+@pytest.mark.parametrize("form", FILE_PATHS)
+def test_paths_of_other_machines_and_suffixes_are_found(form, tmp_path):
+    folder = write_transforms(tmp_path, TRUE, TRUE)
+    data = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(data["frames"]):
+        frame["file_path"] = form.format(i)
+    (folder / "transforms.json").unlink()
+    (folder / FILE_PATHS[form]).write_text(json.dumps(data))
+    for place in (folder, folder / FILE_PATHS[form]):
+        capture = Capture.open(place)
+        assert capture.names == ["f00", "f01", "f02", "f03"] and not capture.notes
+        assert capture.frames[3].image == folder / "images/f03.png"
+
+
+def test_images_that_are_nowhere_are_named_with_the_places_searched(tmp_path):
+    folder = write_transforms(tmp_path, TRUE, TRUE)
+    (folder / "images").rename(folder / "pictures")
+    with pytest.raises(InputError, match=r"got 0 in .*f00.png, .*: no image file in its folder; 4 skipped"):
+        Capture.open(folder)
+
+
+def test_scannetpp_keeps_images_of_two_lenses_apart(tmp_path):
+    folder = tmp_path / "dslr"
+    write_transforms(tmp_path / "made", TRUE, TRUE)
+    data = json.loads((tmp_path / "made/transforms.json").read_text())
+    for frame in data["frames"]:
+        frame["file_path"] = Path(frame["file_path"]).name
+    (folder / "nerfstudio").mkdir(parents=True)
+    (folder / "nerfstudio/transforms_undistorted.json").write_text(json.dumps(data))
+    fisheye = data | {"camera_model": "OPENCV_FISHEYE", "k1": 0.1}
+    (folder / "nerfstudio/transforms.json").write_text(json.dumps(fisheye))
+    (tmp_path / "made/images").rename(folder / "undistorted_images")
+    assert Capture.open(tmp_path).frames[0].lens is None
+    with pytest.raises(InputError, match="no image file"):  # not the undistorted ones
+        Capture.open(folder / "nerfstudio/transforms.json")
+
+
+TEXT_FORMS = {
+    "whole keypoints": lambda text: text,
+    "tabs": lambda text: text.replace(" ", "\t"),
+    "no last newline": lambda text: text.rstrip(),
+    "blank lines": lambda text: text.replace("\n1 ", "\n\n\n1 "),
+    "no head": lambda text: "\n".join(line for line in text.splitlines() if line[:1] != "#"),
+    "Windows' line ends": lambda text: text.replace("\n", "\r\n"),
+}
+
+
+@pytest.mark.parametrize("form", TEXT_FORMS)
+def test_text_of_colmap_as_other_programs_write_it(form, tmp_path):
+    """Every image sees points at whole pixels, so that lines of keypoints look much like those of images."""
+    model = colmap_text(tmp_path) / "sparse" / "0"
+    lines = [line for line in (model / "images.txt").read_text().splitlines() if "png" in line]
+    keypoints = " ".join(f"{10 * n} {n} {n}" for n in range(1, 9))
+    text = "# Image list with two lines of data per image:\n" + "".join(f"{x}\n{keypoints}\n" for x in lines)
+    (model / "images.txt").write_bytes(TEXT_FORMS[form](text).encode())
+    cameras = model / "cameras.txt"
+    cameras.write_bytes(TEXT_FORMS[form](cameras.read_text()).encode())
+    capture = Capture.open(tmp_path)
+    assert capture.names == ["f00", "f01", "f02", "f03"] and not capture.notes
+    np.testing.assert_allclose(capture.frames[2].E, TRUE[2], atol=1e-6)
+    np.testing.assert_allclose(capture.frames[2].K, K)
+
+
+def test_a_camera_that_cannot_be_used_leaves_out_its_images(tmp_path):
+    model = colmap_text(tmp_path) / "sparse" / "0"
+    text = (model / "cameras.txt").read_text()
+    (model / "cameras.txt").write_text(text.replace("2 PINHOLE", "2 FISHY") + "9 EQUIRECTANGULAR 8 4 8 4\n")
+    capture = Capture.open(tmp_path)
+    assert capture.names == ["f00", "f02", "f03"]
+    assert "f01: the model of camera 2 must be one of SIMPLE_PINHOLE" in capture.notes[0]
+
+
+#: Coefficients that bend a picture by several pixels, of every model with a focal length.
+BENDS = {
+    "FOV": [0.6],
+    "EUCM": [0.6, 1.1],
+    "SIMPLE_DIVISION": [-0.1],
+    "DIVISION": [-0.1],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [0.02, 0.01, 0, 0, 0, 0, 0.001, -0.001, 0.001, 0, 0.001, 0],
+    "THIN_PRISM_FISHEYE": [0.05, 0.01, 0.001, -0.001, 0.01, 0, 0.001, 0.001],
+}
+
+
+@pytest.mark.parametrize("model", [name for name, form in MODELS.items() if form.focals])
+def test_every_camera_model_of_colmap_is_straightened_as_pycolmap_says(model, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    camera = pycolmap.Camera.create_from_model_name(1, model, 200.0, *SIZE)
+    form = MODELS[model]
+    bend = BENDS.get(model, [0.05, 0.01, 0.002, -0.001, 0.01, 0, 0, 0][: form.behind])
+    camera.params = [*(200.0, 205.0)[: form.focals], 118.5, 91.5, *bend]
+    folder = colmap_text(tmp_path)
+    numbers = " ".join(f"{value:.17g}" for value in camera.params)
+    lines = [f"{n} {model} {SIZE[0]} {SIZE[1]} {numbers}" for n in range(1, 5)]
+    (folder / "sparse/0/cameras.txt").write_text("\n".join(lines))
+    capture = Capture.open(folder)
+    frame = capture.frames[0]
+    rays = np.random.default_rng(0).uniform(-0.35, 0.35, (50, 2))
+    taken = camera.img_from_cam(np.c_[rays, np.ones(50)]) - 0.5
+    pinhole = rays @ frame.K[:2, :2].T + frame.K[:2, 2]
+    if frame.lens is None:
+        np.testing.assert_allclose(taken, pinhole, atol=1e-6)
+    else:
+        assert np.abs(taken - pinhole).max() > 0.5
+        np.testing.assert_allclose(undistorted_pixels(taken, frame.K, frame.lens), pinhole, atol=0.02)
+        assert capture.image("f00").shape == (*SIZE[::-1], 3)

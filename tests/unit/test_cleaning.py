@@ -10,7 +10,7 @@ from PIL import Image
 from geodiff_plugin import GuidanceConfig
 from geodiff_plugin.evidence.inputs import Inputs
 from geodiff_plugin.evidence.prepare import make_evidence
-from geodiff_plugin.formats.images import distortion_from_text, undistorted
+from geodiff_plugin.formats.lenses import distortion_from_text, undistorted
 from geodiff_plugin.jobs.reading import pinhole
 from geodiff_plugin.matching import build_cost_volume, clean, match_volume
 from geodiff_plugin.matching.cleaning import find_flaws

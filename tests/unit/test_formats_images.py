@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin.formats import as_image_01, picture_size, read_image
-from geodiff_plugin.formats.images import (
+from geodiff_plugin.formats.lenses import (
     distortion_from_text,
     undistorted,
     undistorted_pixels,

@@ -1,0 +1,363 @@
+"""COLMAP's models, read as captures and as calibrations, and written (S5.1).
+
+pycolmap reads a whole model or none; here a camera or an image that cannot be used leaves out its frames. Of
+pycolmap are the lens models that OpenCV does not have (``lenses``).
+
+Source: ``scene/reconstruction_io_text.cc``, ``scene/reconstruction_io_binary.cc`` and ``sensor/models.h`` of
+colmap/colmap.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin._checks import InputError, MissingFileError, bad_value
+from geodiff_plugin.formats.clouds import Cloud
+from geodiff_plugin.formats.files import PathLike, check_file, read_text
+from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout, image_folders
+from geodiff_plugin.formats.out import atomic_path
+from geodiff_plugin.formats.rigs import Camera, CameraChoice, array_of, intrinsics, make_rig, names_of_pair
+from geodiff_plugin.messages import Message
+from geodiff_plugin.types import Rig
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """A camera model: focal lengths before cx cy, its lens as ``Camera.model``, coefficients behind them.
+
+    Coefficients that OpenCV's model has more are 0. A panorama has no focal length.
+    """
+
+    focals: int
+    lens: str
+    behind: int
+
+
+#: In the order of their numbers in binary files, 0 to 17.
+MODELS = {
+    "SIMPLE_PINHOLE": CameraModel(1, "opencv", 0),
+    "PINHOLE": CameraModel(2, "opencv", 0),
+    "SIMPLE_RADIAL": CameraModel(1, "opencv", 1),
+    "RADIAL": CameraModel(1, "opencv", 2),
+    "OPENCV": CameraModel(2, "opencv", 4),
+    "OPENCV_FISHEYE": CameraModel(2, "fisheye", 4),
+    "FULL_OPENCV": CameraModel(2, "opencv", 8),
+    "FOV": CameraModel(2, "FOV", 1),
+    "SIMPLE_RADIAL_FISHEYE": CameraModel(1, "fisheye", 1),
+    "RADIAL_FISHEYE": CameraModel(1, "fisheye", 2),
+    "THIN_PRISM_FISHEYE": CameraModel(2, "THIN_PRISM_FISHEYE", 8),
+    "RAD_TAN_THIN_PRISM_FISHEYE": CameraModel(2, "RAD_TAN_THIN_PRISM_FISHEYE", 12),
+    "SIMPLE_DIVISION": CameraModel(1, "SIMPLE_DIVISION", 1),
+    "DIVISION": CameraModel(2, "DIVISION", 1),
+    "SIMPLE_FISHEYE": CameraModel(1, "fisheye", 0),
+    "FISHEYE": CameraModel(2, "fisheye", 0),
+    "EUCM": CameraModel(2, "EUCM", 2),
+    "EQUIRECTANGULAR": CameraModel(0, "", 0),
+}
+UNDISTORT = "Undistort the images first (colmap image_undistorter) and give the model that it writes."
+CUT_PANORAMA = "Cut its panoramas into pinhole views first (panorama_sfm.py of pycolmap's examples)."
+CAMERA = re.compile(r"^[ \t]*(\d+)[ \t]+([A-Z_]+)[ \t]+(\d+)[ \t]+(\d+)[ \t]+(\S.*)$", re.MULTILINE)
+#: Number, quaternion, translation, camera, name. Lines of keypoints have more numbers where the name stands.
+IMAGE = re.compile(
+    r"^[ \t]*(\d+)((?:[ \t]+[-+.\deE]+){7})[ \t]+(\d+)[ \t]+(?![-+.\deE]+[ \t]+\S)(\S.*)$", re.MULTILINE
+)
+CAMERAS_MARK, IMAGES_MARK = "# Camera list with", "# Image list with"
+_ANY_CAMERA = rf"^[ \t]*\d+[ \t]+(?:{'|'.join(MODELS)})[ \t]+\d+[ \t]+\d+[ \t]+\S"
+MARK = rf"{CAMERAS_MARK}|{IMAGES_MARK}|{_ANY_CAMERA}|{IMAGE.pattern}"
+LONGEST_HEAD = 200
+#: Where a project has its models, below its folder; of several in one place the largest is taken.
+PLACES = (
+    ("",),
+    ("sparse/*", "sparse"),
+    ("colmap/sparse/*", "colmap/sparse", "colmap"),
+    ("dense/sparse", "dense/*/sparse"),
+    ("distorted/sparse/*",),
+)
+#: Files of a model's cameras and images, text before binary.
+Files = tuple[Path, Path]
+#: A start for other programs: text of a million points is 50 MB.
+MOST_POINTS = 100_000
+#: Points that fewer images see, or that lie further off in pixels, are no known depths.
+FEWEST_VIEWS, MOST_ERROR_PX = 3, 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """An image of a model: its number, ``(4, 4)`` T_camera_from_world, its camera's number."""
+
+    number: int
+    T: np.ndarray
+    camera: int
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Cameras of a model by number, those that cannot be used with the reason, and images by name."""
+
+    cameras: dict[int, Camera]
+    unusable: dict[int, str]
+    images: dict[str, PosedImage]
+
+    def camera(self, number: int) -> Camera:
+        """The camera of a number; ``InputError`` with the reason where it cannot be used."""
+        if number in self.unusable:
+            raise InputError(self.unusable[number])
+        if number not in self.cameras:
+            have = ", ".join(map(str, self.cameras)) or "none"
+            bad_value("the cameras", f"with camera {number}", f"only {have}")
+        return self.cameras[number]
+
+
+def model_files(folder: Path) -> Files | None:
+    """The files of a model's cameras and images, text before binary; ``None`` where a folder has none."""
+    for suffix in (".txt", ".bin"):
+        files = folder / f"cameras{suffix}", folder / f"images{suffix}"
+        if all(file.is_file() for file in files):
+            return files
+    return None
+
+
+def calibration_text(path: PathLike) -> str:
+    """The text of a calibration file, of a COLMAP model without its points."""
+    path = check_file(path, "calibration", "a calibration file")
+    if path.name == "cameras.bin":
+        return "\n".join([CAMERAS_MARK, *_binary_cameras(path)])
+    if path.name == "images.bin":
+        return "\n".join([IMAGES_MARK, *_binary_images(path)])
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        head = file.readline(LONGEST_HEAD)
+        if head.startswith(IMAGES_MARK) or path.name == "images.txt":  # which may exceed what a text may be
+            lines = [line for line in (head, *file) if IMAGE.match(line)]
+            if not lines:
+                bad_value("calibration", "images.txt of a COLMAP model", f"{path} without a line of an image")
+            return "\n".join([IMAGES_MARK, *lines])
+    return read_text(path, "calibration", "a calibration file")
+
+
+class _Bytes:
+    """Reads little-endian numbers of a file, one group after the other; ``"z"`` is a text up to a zero."""
+
+    def __init__(self, path: Path) -> None:
+        self._data, self._at, self._path = path.read_bytes(), 0, path
+
+    def __call__(self, layout: str) -> tuple[Any, ...]:
+        if layout == "z":
+            layout = f"{self._data.find(0, self._at) - self._at}sx"
+        try:
+            numbers = struct.unpack_from(f"<{layout}", self._data, self._at)
+        except struct.error:
+            bad_value(f"{self._path}", "a binary COLMAP file", "less than it says it holds", "Is it cut off?")
+        self._at += struct.calcsize(f"<{layout}")
+        return numbers
+
+
+def _binary_cameras(path: Path) -> Iterator[str]:
+    take = _Bytes(path)
+    for _ in range(*take("Q")):
+        number, model, width, height = take("IiQQ")
+        if not 0 <= model < len(MODELS):  # how many parameters follow is not known
+            expected = f"with camera models 0 to {len(MODELS) - 1} of COLMAP"
+            bad_value(f"{path}", expected, model, "Convert it to text: colmap model_converter.")
+        name, form = list(MODELS.items())[model]
+        count = form.focals + 2 + form.behind
+        yield f"{number} {name} {width} {height} {' '.join(map(repr, take(f'{count}d')))}"
+
+
+def _binary_images(path: Path) -> Iterator[str]:
+    take = _Bytes(path)
+    for _ in range(*take("Q")):
+        number, *pose, camera = take("I7dI")
+        (name,), (points,) = take("z"), take("Q")
+        take(f"{24 * points}x")
+        yield f"{number} {' '.join(map(repr, pose))} {camera} {name.decode(errors='replace')}"
+
+
+def _camera(number: str, name: str, size: tuple[int, int], words: str) -> Camera:
+    if name not in MODELS:
+        bad_value(f"the model of camera {number}", f"one of {', '.join(MODELS)}", name, UNDISTORT)
+    form = MODELS[name]
+    if not form.focals:
+        bad_value(f"the model of camera {number}", "one with a focal length", name, CUT_PANORAMA)
+    expected = (form.focals + 2 + form.behind,)
+    numbers = array_of(words.split(), expected, f"parameters of camera {number}")
+    # COLMAP puts the centre of the first pixel at (0.5, 0.5).
+    cx, cy = numbers[form.focals : form.focals + 2] - 0.5
+    coefficients = numbers[form.focals + 2 :]
+    if form.lens in ("opencv", "fisheye"):
+        coefficients = np.pad(coefficients, (0, max(4 - form.behind, 0)))
+    return Camera(intrinsics(numbers[0], numbers[form.focals - 1], cx, cy), size, coefficients, form.lens)
+
+
+def _images(text: str) -> dict[str, PosedImage]:
+    images = {}
+    for number, words, camera, name in IMAGE.findall(text):
+        qw, qx, qy, qz, *translation = array_of(words.split(), (7,), f"image {number}")
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_quat([qx, qy, qz, qw]).as_matrix()  # refuses zeros
+        T[:3, 3] = translation
+        images[name.strip()] = PosedImage(int(number), T, int(camera))
+    return images
+
+
+def _model(cameras_text: str, images_text: str) -> Model:
+    cameras, unusable = dict[int, Camera](), dict[int, str]()
+    for number, name, width, height, words in CAMERA.findall(cameras_text):
+        try:
+            cameras[int(number)] = _camera(number, name, (int(width), int(height)), words)
+        except InputError as error:
+            unusable[int(number)] = str(error)
+    return Model(cameras, unusable, _images(images_text))
+
+
+def read_model(files: Files) -> Model:
+    """The model of its files of cameras and images."""
+    return _model(*map(calibration_text, files))
+
+
+def read_points(folder: Path) -> dict[int, np.ndarray]:
+    """The reliable points ``(n, 3)`` that an image of a model sees, by its number, in the model's world."""
+    path = folder / "points3D.txt"
+    rows = _text_points(path) if path.exists() else _binary_points(path.with_suffix(".bin"))
+    seen: dict[int, list[Sequence[Any]]] = {}
+    for xyz, error_px, images in rows:
+        if len(images) >= FEWEST_VIEWS and float(error_px) <= MOST_ERROR_PX:
+            for image in set(images):
+                seen.setdefault(int(image), []).append(xyz)
+    return {image: array_of(points, (-1, 3), f"points of {path}") for image, points in seen.items()}
+
+
+def _text_points(path: Path) -> Iterator[tuple[Sequence[Any], Any, Sequence[Any]]]:
+    with path.open(encoding="utf-8") as file:
+        for line in file:
+            words = line.split()
+            if words and not line.startswith("#"):
+                yield words[1:4], words[7], words[8::2]
+
+
+def _binary_points(path: Path) -> Iterator[tuple[Sequence[Any], Any, Sequence[Any]]]:
+    take = _Bytes(check_file(path, "the model", "points3D.txt or points3D.bin"))
+    for _ in range(*take("Q")):
+        *xyz, error_px, seen = take("8x3d3xdQ")
+        yield xyz, error_px, take(f"{2 * seen}I")[::2]
+
+
+def read_colmap(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """The two images of ``choice.image_names``, both files in any order, in the model's unit."""
+    by_kind = {CAMERA.search(text) is not None and IMAGES_MARK not in text: text for text in texts}
+    if len(by_kind) != 2:
+        bad_value("the files", "cameras.txt and images.txt", "two of one kind")
+    model = _model(by_kind[True], by_kind[False])
+    left, right = (model.images[name] for name in names_of_pair(model.images, choice))
+    cameras = [model.camera(image.camera) for image in (left, right)]
+    return make_rig(cameras[0], cameras[1], left.T @ np.linalg.inv(right.T))
+
+
+def _models_below(path: Path) -> list[Files]:
+    """The models of the first of ``PLACES`` that has any."""
+    if path.is_file():
+        return [files] if path.stem in ("cameras", "images") and (files := model_files(path.parent)) else []
+    for place in PLACES:
+        folders = sorted(at for pattern in place for at in ([path] if not pattern else path.glob(pattern)))
+        if models := [files for files in map(model_files, folders) if files]:
+            return models
+    return []
+
+
+def _largest(models: Iterable[Files], project: Path) -> tuple[Files, Model, tuple[Message, ...]]:
+    """The model with most images, the first of several, and what to say where there are others."""
+    read = [(files, read_model(files)) for files in models]
+    files, model = max(read, key=lambda each: len(each[1].images))
+    others = [
+        f"{each[0].parent.relative_to(project)} with {len(other.images)}"
+        for each, other in read
+        if other is not model
+    ]
+    if not others:
+        return files, model, ()
+    said = f"{files[0].parent.relative_to(project)}, with {len(model.images)} images, is used"
+    note = f"{said}, the largest of {len(read)} models; left out: {', '.join(others)}."
+    return files, model, (Message("capture.part", f"{note} To take another, give its folder."),)
+
+
+def _around(folder: Path, project: Path) -> list[Path]:
+    """The folder of a model and those above it, up to its project, where images may lie."""
+    folder, project = folder.absolute(), project.absolute()
+    above = [folder, *folder.parents][:4]
+    inside = folder != project and folder.is_relative_to(project)
+    return [at for at in above if at.is_relative_to(project)] if inside else above
+
+
+def read_colmap_capture(path: Path) -> Layout | None:
+    """A model (text or binary), or the project that holds one."""
+    models = _models_below(path)
+    if not models:
+        return None
+    files, model, notes = _largest(models, path)
+    folder = files[0].parent
+    try:
+        seen = read_points(folder)
+    except MissingFileError:
+        seen = {}
+    images = Images(sorted(model.images), image_folders(*_around(folder, path)), path)
+
+    def build(frame: CaptureFrame, image: PosedImage) -> Candidate:
+        posed = replace(frame, E=np.linalg.inv(image.T), points=seen.get(image.number))
+        return Candidate(posed, model.camera(image.camera))
+
+    candidates = [images.candidate(name, partial(build, image=model.images[name])) for name in images.names]
+    return Layout("COLMAP model", None, candidates, as_stored=True, notes=notes)
+
+
+def check_colmap_names(names: Sequence[str]) -> None:
+    """Refuse names of images that a model cannot hold: those with a blank."""
+    for name in names:
+        if any(letter.isspace() for letter in name):
+            bad_value("the name of an image in a COLMAP model", "without blanks", repr(name), "Rename it.")
+
+
+def write_colmap(
+    folder: PathLike,
+    views: Sequence[tuple[str, np.ndarray, np.ndarray, tuple[int, int]]],
+    cloud: Cloud,
+    seen: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
+) -> None:
+    """Write a text model into an existing folder, for splatting and MVS; poses are world-to-camera there.
+
+    ``views`` has ``(name, K, E, (width, height))`` of every image: no blanks in names, E camera-to-world, the
+    first pixel's centre at (0, 0), which is (0.5, 0.5) in the file. ``seen`` has of every image the pixels
+    ``(n, 2)`` at which it sees points, and their rows ``(n,)`` in the cloud; without it at most 100 000
+    points are written, without tracks. Raises ``ValueError`` for a name with a blank.
+    """
+    check_colmap_names([name for name, *_ in views])
+    cloud = cloud.thinned(MOST_POINTS) if seen is None else cloud
+    seen = [(np.zeros((0, 2)), np.zeros(0, int))] * len(views) if seen is None else seen
+    cameras = [f"{CAMERAS_MARK} CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    images = [f"{IMAGES_MARK} IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then POINTS2D[]"]
+    points = ["# 3D point list with POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
+    tracks = [""] * len(cloud.points_m)
+    for number, ((name, K, E, (width, height)), (px, rows)) in enumerate(zip(views, seen, strict=True), 1):
+        numbers = " ".join(f"{v:.9g}" for v in (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
+        cameras.append(f"{number} PINHOLE {width} {height} {numbers}")
+        T = np.linalg.inv(E)
+        qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat()
+        numbers = " ".join(f"{v:.12g}" for v in (qw, qx, qy, qz, *T[:3, 3]))
+        images.append(f"{number} {numbers} {number} {name}")
+        each = zip(px + 0.5, rows, strict=True)
+        images.append(" ".join(f"{x:.3f} {y:.3f} {row + 1}" for (x, y), row in each))
+        for index, row in enumerate(rows):
+            tracks[row] += f" {number} {index}"
+    rows_of = zip(cloud.points_m, cloud.colours, tracks, strict=True)
+    for number, ((x, y, z), (r, g, b), track) in enumerate(rows_of, 1):
+        points.append(f"{number} {x:.5f} {y:.5f} {z:.5f} {r} {g} {b} 0{track}")
+    for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
+        with atomic_path(Path(folder) / f"{name}.txt") as temporary:
+            temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,0 +1,186 @@
+"""``transforms.json`` of nerfstudio, instant-ngp and their converters, as a capture and as a calibration.
+
+Source: ``nerfstudio/data/dataparsers/nerfstudio_dataparser.py`` and ``scannetpp_dataparser.py`` of
+nerfstudio-project/nerfstudio, ``src/nerf_loader.cu`` and ``scripts/colmap2nerf.py`` of NVlabs/instant-ngp.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geodiff_plugin._checks import bad_value, check_positive
+from geodiff_plugin.formats.files import read_text, stored_size
+from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout, image_folders
+from geodiff_plugin.formats.rigs import (
+    LENS_MODELS,
+    Camera,
+    CameraChoice,
+    array_of,
+    intrinsics,
+    make_rig,
+    names_of_pair,
+    rigid,
+)
+from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
+from geodiff_plugin.messages import Message
+from geodiff_plugin.types import Rig
+
+#: Of a transforms.json, by OpenCV's model: coefficients in its order, and those that it does not have.
+NERF_LENSES = {
+    "opencv": (("k1", "k2", "p1", "p2", "k3"), ("k4",)),
+    "fisheye": (("k1", "k2", "k3", "k4"), ("p1", "p2")),
+}
+NERF_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
+#: With these entries the poses come from structure from motion.
+OF_COLMAP = ("colmap_im_id", "sharpness")
+#: Files of a folder, the first that is there: nerfstudio's, NeRF's rendered scenes, ScanNet++'s.
+FILES = (
+    "transforms.json",
+    "transforms_train.json",
+    "dslr/nerfstudio/transforms_undistorted.json",
+    "dslr/nerfstudio/transforms.json",
+    "nerfstudio/transforms_undistorted.json",
+    "nerfstudio/transforms.json",
+)
+#: Where ScanNet++ keeps the images of its two files: both have the same names, other lenses.
+UNDISTORTED_FOLDERS = ("undistorted_images", "resized_undistorted_images")
+DISTORTED_FOLDERS = ("resized_images", "original_images")
+#: What files call the map of known depths of a frame.
+DEPTHS = ("depth_file_path", "depth_path")
+DEPTH_SUFFIXES = (".png", ".npy", ".tiff", ".tif", ".exr")
+Frame = dict[str, Any]
+
+
+def nerf_frames(text: str) -> Iterator[Frame]:
+    """Every frame, with the entries of the whole file that it does not have itself."""
+    data = json.loads(text)
+    shared = {key: value for key, value in data.items() if key not in ("frames", "transform_matrix")}
+    for number, frame in enumerate(data["frames"]):
+        yield shared | {"file_path": f"frame {number}"} | frame
+
+
+def nerf_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> Camera:
+    """The camera of a frame; ``image_size`` is that of its image, for files without ``w`` and ``h``."""
+    size = (frame["w"], frame["h"]) if "w" in frame else image_size
+    if size is None:
+        cure = "Give image_size, the (width, height) of the images."
+        bad_value("the file", "one with entries 'w' and 'h'", "none", cure)
+    focals = []
+    for axis, side in zip("xy", size, strict=True):
+        angle = frame.get(f"camera_angle_{axis}")
+        if f"fl_{axis}" in frame:
+            focals.append(frame[f"fl_{axis}"])
+        elif angle is not None and not 0 < angle < math.pi:
+            bad_value(f"camera_angle_{axis}", "in radians, between 0 and pi", angle, "Is it in degrees?")
+        elif angle is not None:
+            focals.append(0.5 * float(side) / math.tan(0.5 * angle))
+    if not focals:
+        bad_value("the file", "one with an entry 'fl_x' or 'camera_angle_x'", "none")
+    K = intrinsics(focals[0], focals[-1], frame.get("cx", size[0] / 2), frame.get("cy", size[1] / 2))
+    K[:2, 2] -= 0.5  # as COLMAP, nerfstudio (cameras.py) and instant-ngp have the first centre at (0.5, 0.5)
+    model = str(frame.get("camera_model", "OPENCV_FISHEYE" if frame.get("is_fisheye") else "OPENCV"))
+    # Another model is refused with its name.
+    coefficients, others = NERF_LENSES.get(LENS_MODELS.get(model.lower(), ""), ((), ()))
+    lens = frame | dict(zip(NERF_PARAMS, frame.get("distortion_params", ()), strict=False))
+    wrong = [lens[key] for key in others if lens.get(key)]
+    if wrong:
+        cure = "OpenCV does not have this model: undistort or rectify both images first."
+        bad_value(" and ".join(others), f"zero for {model}", wrong, cure)
+    return Camera(K, size, [lens.get(key, 0.0) for key in coefficients], model)
+
+
+def nerf_pose(frame: Frame) -> np.ndarray | None:
+    """``(4, 4)`` camera-to-world in OpenCV's axes, lengths as before nerfstudio's ``applied_scale``.
+
+    ``None`` for a frame without pose: null, or with null or NaN in it. A homogeneous matrix may be scaled.
+    """
+    matrix = frame.get("transform_matrix")
+    if matrix is None or _unknown(matrix):
+        return None
+    numbers = array_of(matrix, (-1,), "transform_matrix")
+    if numbers.size == 16 and numbers[15] > 0 and not numbers[12:15].any():
+        numbers = numbers / numbers[15]
+    pose = rigid(numbers, "transform_matrix") @ OPENGL_FROM_OPENCV
+    pose[:3, 3] /= check_positive(frame.get("applied_scale", 1.0), "applied_scale", "units")
+    return pose
+
+
+def _unknown(matrix: Any) -> bool:
+    """Whether a matrix holds null or NaN anywhere."""
+    rows = matrix if isinstance(matrix, list) else [matrix]
+    numbers = [number for row in rows for number in (row if isinstance(row, list) else [row])]
+    return any(number is None or (isinstance(number, float) and math.isnan(number)) for number in numbers)
+
+
+def read_nerf(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """The two images of ``choice.image_names``, in the unit of the poses."""
+    frames = {str(frame.get("file_path")): frame for frame in nerf_frames(texts[0])}
+    left, right = (frames[name] for name in names_of_pair(frames, choice))
+    poses = [pose for pose in map(nerf_pose, (left, right)) if pose is not None]
+    if len(poses) < 2:
+        bad_value("transform_matrix", "given for both images", "none for one of them")
+    E = np.linalg.inv(poses[0]) @ poses[1]
+    return make_rig(nerf_camera(left, choice.image_size), nerf_camera(right, choice.image_size), E)
+
+
+def read_transforms(path: Path) -> Layout | None:
+    """The frames that a file names, or the file of a folder; depth maps by name or as ``depth/NAME``."""
+    file = path if path.is_file() else next((path / name for name in FILES if (path / name).is_file()), path)
+    if file.suffix != ".json" or not file.is_file():
+        return None
+    text = read_text(file, "PATH")
+    if file == path and not ('"frames"' in text and '"file_path"' in text):
+        return None
+    frames = list(nerf_frames(text))
+    images = Images([str(frame["file_path"]) for frame in frames], _folders(file), file)
+    candidates, named = [], set[str]()
+    for name, entries in zip(images.names, frames, strict=True):
+        candidate = images.candidate(name, partial(_build, entries=entries, folder=file.parent))
+        if name in named:
+            candidate = replace(candidate, problem="named twice; the first is used")
+        candidates.append(candidate)
+        named.add(name)
+    solved = any(key in entries for entries in frames for key in OF_COLMAP)
+    return Layout("transforms.json", None if solved else "m", candidates, as_stored=True, notes=_notes(file))
+
+
+def _folders(file: Path) -> list[Path]:
+    """Where the images of a file may lie, from its own folder on."""
+    of_scannetpp = UNDISTORTED_FOLDERS if "undistorted" in file.stem else DISTORTED_FOLDERS
+    beside = [file.parent.parent / name for name in of_scannetpp]
+    return [*image_folders(file.parent), *(folder for folder in beside if folder.is_dir())]
+
+
+def _notes(file: Path) -> tuple[Message, ...]:
+    """What to say of files of other frames beside the one that is read."""
+    others = sorted(other.name for other in file.parent.glob("transforms_*.json") if other != file)
+    if not file.name.startswith("transforms_train") or not others:
+        return ()
+    sentence = f"{file.name} is read; {', '.join(others)} beside it are not."
+    return (Message("capture.part", sentence),)
+
+
+def _build(frame: CaptureFrame, entries: Frame, folder: Path) -> Candidate:
+    camera = nerf_camera(entries, stored_size(frame.image, f"{frame.image}"))
+    named = next((entries[key] for key in DEPTHS if entries.get(key)), None)
+    names = [f"depth/{frame.image.stem}{suffix}" for suffix in DEPTH_SUFFIXES] if named is None else [named]
+    maps = (folder / str(name).replace("\\", "/") for name in names)
+    depth = next((map_ for map_ in maps if map_.is_file()), None)
+    posed = replace(frame, E=nerf_pose(entries), depth=depth, depth_per_m=_depth_per_m(entries))
+    return Candidate(posed, camera)
+
+
+def _depth_per_m(entries: Frame) -> float | None:
+    """Units of the depth maps in a metre, by either program's factor, which makes metres of them."""
+    for key in ("depth_unit_scale_factor", "integer_depth_scale"):
+        if entries.get(key) is not None:
+            return 1.0 / float(check_positive(entries[key], key, "metres a unit"))
+    return None
