@@ -93,29 +93,53 @@ def check_options(options: Any, name_of: Callable[[Field[Any]], str] = flag_of) 
 class PriorOptions:
     """Which prior runs, and where: what every command that runs one has in common."""
 
-    prior: str = declare("bundled", "'bundled', a hub id or a folder; KEY:folder says which kind.")
-    space: str | None = declare(
-        None, "Space of the prior's map, in place of its folder's: " + ", ".join(SPACES) + ".", choices=SPACES
+    prior: str = declare(
+        "bundled", "The prior: 'bundled', a hub id or a folder; KEY:FOLDER names the adapter of a folder."
     )
-    steps: int | None = declare(None, "Denoising steps; default: the prior's, at least 4.", low=1, high=1000)
+    space: str | None = declare(
+        None,
+        f"What the prior's map is affine in, where its folder does not say: {', '.join(SPACES)}.",
+        choices=SPACES,
+    )
+    steps: int | None = declare(
+        None, "Denoising steps (default: the prior's own number, at least 4).", low=1, high=1000
+    )
     seed: int = declare(0, "Seed of the noise.", low=0, high=2**63 - 1)
-    device: str = declare("auto", "auto, cpu, cuda, cuda:N or mps.")
+    device: str = declare("auto", "Where it runs: auto, cpu, cuda, cuda:N or mps.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(PriorOptions):
     """How it runs: what ``geodiff depth``, the page and the ComfyUI node have in common."""
 
-    option: tuple[str, ...] = declare((), "An option of the prior, NAME=VALUE (GeoWizard: domain=outdoor).")
-    ensemble: int = declare(1, "Members; the spread of 2 or more is the uncertainty.", low=1, high=1000)
-    resolution: int | None = declare(None, "Longer side for the prior, px; 0: the image's.", low=0, high=8192)
-    near: float | None = declare(None, "Nearest depth to search, metres.", above_0="metres")
-    far: float | None = declare(None, "Farthest depth to search, metres.", above_0="metres")
-    dtype: str = declare("float32", "float32, float16 or bfloat16.", choices=DTYPES)
-    preset: str = declare(
-        "default", "default, fast (coarser matches, poses as given), or paper (Algorithm 1).", choices=PRESETS
+    option: tuple[str, ...] = declare(
+        (), "An option of the prior as NAME=VALUE, such as domain=outdoor of GeoWizard; repeatable."
     )
-    knob: tuple[str, ...] = declare((), "A knob (geodiff info --knobs), as inner_steps=0; repeatable.")
+    ensemble: int = declare(
+        1,
+        "Number of runs with different noise; the spread of two or more is the uncertainty.",
+        low=1,
+        high=1000,
+    )
+    resolution: int | None = declare(
+        None,
+        "Longer side of the image for the prior, in pixels; 0 keeps its size (default: the prior's own).",
+        low=0,
+        high=8192,
+    )
+    near: float | None = declare(None, "Nearest depth to search, in metres.", above_0="metres")
+    far: float | None = declare(None, "Farthest depth to search, in metres.", above_0="metres")
+    dtype: str = declare(
+        "float32", "Number format of the prior: float32, float16 or bfloat16.", choices=DTYPES
+    )
+    preset: str = declare(
+        "default",
+        "default, fast (coarser matches, poses as given) or paper (Algorithm 1).",
+        choices=PRESETS,
+    )
+    knob: tuple[str, ...] = declare(
+        (), "A knob of the guidance, such as inner_steps=0; repeatable. geodiff info --knobs lists them."
+    )
 
     def check(self, name_of: Callable[[Field[Any]], str] = flag_of) -> None:
         """Everything that can be said before a file is opened or torch is imported."""
@@ -123,7 +147,7 @@ class RunOptions(PriorOptions):
         names = {field.name: name_of(field) for field in dataclasses.fields(self)}
         if (self.near is None) != (self.far is None):
             missing, given = ("near", "far") if self.near is None else ("far", "near")
-            bad_value(names[missing], f"given together with {names[given]}", "none", "Both in metres.")
+            refuse(f"{names[given]} needs {names[missing]}. Give both, in metres.")
         if self.near is not None and self.far is not None and self.near >= self.far:
             got, cure = f"{self.near:g} and {self.far:g}", "Both are metres from the camera."
             bad_value(names["near"], f"less than {names['far']}", got, cure)

@@ -26,8 +26,8 @@ NUMBERS = {
     "cx": "cx, px",
     "cy": "cy, px",
     "cx_right": "Right camera's cx, px",
-    "baseline": "Distance of the cameras, m",
-    "known_length": "Instead: a length in the left photograph, m",
+    "baseline": "Distance between the cameras, m",
+    "known_length": "Or a known length in the left photograph, m",
     "near": "Nearest depth, m",
     "far": "Farthest depth, m",
 }
@@ -114,7 +114,7 @@ def _views() -> dict[str, Any]:
     with gr.Column(visible=False) as lens, gr.Row():
         for name, placeholder in (("fx", "focal"), ("fy", "as fx"), ("cx", "middle"), ("cy", "middle")):
             drawn[name] = _optional(name, placeholder)
-    note = "cx + doffs; empty means the same cx as left"
+    note = "cx + doffs; empty means that of the left camera"
     drawn["cx_right"] = cx_right = _optional("cx_right", "assumed as cx", info=note, visible=False)
     drawn["baseline"] = _optional("baseline", "as the calibration file says")
 

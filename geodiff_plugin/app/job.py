@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from geodiff_plugin._checks import bad_value, check_choice, check_number
+from geodiff_plugin._checks import bad_value, check_choice, check_number, refuse
 from geodiff_plugin.formats.files import upright_size
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.jobs.options import DepthOptions
@@ -77,7 +77,7 @@ def options_of(
     paths, sizes = [], []
     for name, path in (("the left photograph", left), ("the right photograph", right)):
         if path is None:
-            bad_value(name, "given", "nothing", "Drop a picture into its field.")
+            refuse(f"{name} is missing: drop a picture into its field.")
         width, height = upright_size(path, name)
         if width * height > MOST_MEGAPIXELS * 1_000_000:
             expected = f"an image of at most {MOST_MEGAPIXELS} megapixels"
@@ -86,21 +86,13 @@ def options_of(
         sizes.append((width, height))
     given = {name: value for name, value in (lens or {}).items() if value is not None}
     if way == "file" and not calib:
-        cure = "Choose one, or give focal length and baseline."
-        bad_value("calibration", "a calibration file", "none", cure)
+        refuse("The calibration file is missing: choose one, or give focal length and baseline.")
     missing = [name for name, value in (("fx", given.get("fx")), ("baseline", baseline)) if value is None]
     if way == "numbers" and missing:
-        bad_value(" and ".join(missing), "given", "nothing", "fx is in pixels, the baseline in metres.")
-    if way == "photographs" and (baseline is None) == (known_length is None):
-        cure = "Photographs have no unit: measure the distance of the cameras, or a length in the left one."
-        got = "nothing" if baseline is None else "both"
-        bad_value("the distance of the cameras, or a known length,", "given", got, cure)
-    if way == "photographs" and known_length is not None:
-        numbers = ENDS.findall(ends or "")
-        if len(numbers) != 4:
-            cure = "Tap both on the left photograph, or type x1, y1, x2, y2."
-            bad_value("the ends of the known length", "two pixels", repr(ends or ""), cure)
-        run["known_length"] = ",".join([*numbers, f"{known_length}"])
+        names = " and ".join(missing)
+        refuse(f"Give {names} as well: fx is in pixels, the baseline in metres.")
+    if way == "photographs":
+        run["known_length"] = _length_of_photographs(baseline, known_length, ends)
     if way != "file" and "fx" in given:
         middle = {c: (side - 1) / 2 for c, side in zip(("cx", "cy"), sizes[0], strict=True)}
         run |= {"fy": given["fx"]} | middle | given
@@ -114,6 +106,24 @@ def options_of(
         export=("glb", "mesh"),
         **run,
     )
+
+
+def _length_of_photographs(
+    baseline: float | None, known_length: float | None, ends: str | None
+) -> str | None:
+    """The known length as ``--known-length`` takes it, ``None`` where the baseline is given instead."""
+    lengths = "the distance between the cameras, or a length in the left photograph"
+    if baseline is None and known_length is None:
+        refuse(f"Photographs have no unit: measure {lengths}.")
+    if baseline is not None and known_length is not None:
+        refuse(f"Give {lengths}, not both.")
+    if known_length is None:
+        return None
+    numbers = ENDS.findall(ends or "")
+    if len(numbers) != 4:
+        cure = "tap both on the left photograph, or type x1, y1, x2, y2"
+        refuse(f"The ends of the known length are two pixels: {cure}.")
+    return ",".join([*numbers, f"{known_length}"])
 
 
 def run_job(
@@ -141,8 +151,7 @@ def run_job(
             inputs = read_pair(options, names=names)
         guidance = inputs.guidance
         if guidance.unit is None:  # lengths are what the page is for
-            cure = "This file has no unit: measure how far the two cameras were from each other, in metres."
-            bad_value("the distance of the cameras", "given", "nothing", cure)
+            refuse("This file has no unit: give the distance between the two cameras in metres.")
         stage(0.05, "Loading the prior")
         pipe = priors.get(options.prior)
         total = guidance.denoising_steps(options.steps, pipe.default_denoising_steps) * options.ensemble

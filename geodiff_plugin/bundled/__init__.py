@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import torch
 from diffusers import MarigoldDepthPipeline
-from diffusers.utils import logging as diffusers_logging
-from transformers.utils import logging as transformers_logging
 
 from geodiff_plugin.priors import BUNDLED_FOLDER
+from geodiff_plugin.priors.loading import no_bars
 
 __all__ = ["load_bundled_prior", "no_bars", "open_pipeline"]
 
@@ -36,16 +33,3 @@ def open_pipeline(
         )
     pipeline.set_progress_bar_config(disable=True)
     return pipeline.to("cpu" if device is None else device)
-
-
-@contextmanager
-def no_bars() -> Iterator[None]:
-    """Switch off the progress bars of both hosts, for files this small, and put them back after."""
-    shown = [log for log in (diffusers_logging, transformers_logging) if log.is_progress_bar_enabled()]
-    for log in shown:
-        log.disable_progress_bar()
-    try:
-        yield
-    finally:
-        for log in shown:
-            log.enable_progress_bar()

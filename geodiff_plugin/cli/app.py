@@ -41,7 +41,7 @@ def _depth(options: DepthOptions) -> None:
 
     if not is_bag(options.left):
         names = ("topic_left", "topic_right", "tolerance", "encoding")
-        options.refuse(names, "left out where LEFT is not a bag", cure="It is for bags.")
+        options.refuse(names, "{} is for bags, and LEFT is none.")
     if is_bag(options.left):
         _imported("cli.run.run_bag")(options)
     elif is_many(options.left):
@@ -49,8 +49,7 @@ def _depth(options: DepthOptions) -> None:
         refs = start_many(options, silent if options.quiet else say)
         _imported("cli.run.run_many")(options, refs)
     else:
-        cure = "Give folders, a list, videos or a bag."
-        options.refuse(["steady"], "given with several pairs in order", "one pair", cure)
+        options.refuse(["steady"], "{} needs frames in order: folders, a list, videos or a bag.")
         options = with_folder(options, "geodiff-out")
         with start_pair(options) as folder:
             started = time.perf_counter()
@@ -63,9 +62,11 @@ def _capture(options: CaptureOptions) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Demo:
-    out: Path | None = _out(None, "Folder; geodiff-demo, or -2 and so on where that is taken.", "--out", "-o")
+    out: Path | None = _out(
+        None, "Output folder (default: geodiff-demo, with a number if that exists).", "--out", "-o"
+    )
     overwrite: bool = _out(False, "Write into a folder that holds files.")
-    quiet: bool = _out(False, "No progress bar.", "--quiet", "-q")
+    quiet: bool = _out(False, "Show no progress bar.", "--quiet", "-q")
 
     def run(self) -> None:
         pair = Path(__file__).resolve().parents[1] / "bundled" / "pair"
@@ -78,35 +79,41 @@ class _Demo:
 
 @dataclass(frozen=True, kw_only=True)
 class _Info:
-    prior: str | None = declare(None, "Describe this prior as well.")
-    space: str | None = declare(None, "Space of its map, in place of what its folder says.", choices=SPACES)
-    knobs: bool = declare(False, "List the knobs of the guidance instead: default, range, what each does.")
+    prior: str | None = declare(None, "Also describe this prior.")
+    space: str | None = declare(
+        None, "What its map is affine in, where its folder does not say.", choices=SPACES
+    )
+    knobs: bool = declare(False, "Instead list the knobs of the guidance, with default, range and meaning.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Video:
-    frames: tuple[Path, ...] = declare(MISSING, "Results of geodiff depth, or maps.", "", metavar="FRAME...")
-    out: Path = _out(Path("depth.webp"), "The video: .mp4 (OpenCV), .webp or .gif.", "--out", "-o")
-    fps: float = declare(10.0, "Frames a second.")
-    near: float | None = declare(None, "Depth of the last colour, metres.")
-    far: float | None = declare(None, "Depth of the first colour, metres.")
-    overwrite: bool = _out(False, "Replace a file of that name.")
+    frames: tuple[Path, ...] = declare(
+        MISSING, "Folders of geodiff depth, or depth maps as .npy, in order.", "", metavar="FRAME..."
+    )
+    out: Path = _out(Path("depth.webp"), "The video: .mp4, .webp or .gif.", "--out", "-o")
+    fps: float = declare(10.0, "Frames per second.")
+    near: float | None = declare(None, "Depth of the last colour, in metres (default: the maps' own).")
+    far: float | None = declare(None, "Depth of the first colour, in metres (default: the maps' own).")
+    overwrite: bool = _out(False, "Replace an existing file.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Submit:
-    results: tuple[Path, ...] = declare(MISSING, "Folders of geodiff depth.", "", metavar="RESULT...")
-    to: str = declare(MISSING, "The benchmark: middlebury or eth3d.", choices=("middlebury", "eth3d"))
-    out: Path = _out(MISSING, "Folder for its files.", "--out", "-o")
-    method: str = declare("GeoDiff", "Name of the method in Middlebury's files.")
+    results: tuple[Path, ...] = declare(MISSING, "Folders that geodiff depth wrote.", "", metavar="RESULT...")
+    to: str = declare(MISSING, "Benchmark: middlebury or eth3d.", choices=("middlebury", "eth3d"))
+    out: Path = _out(MISSING, "Output folder.", "--out", "-o")
+    method: str = declare("GeoDiff", "Name of the method in the files of Middlebury.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Page:
-    prior: tuple[str, ...] = declare(("bundled",), "A prior that visitors may choose; repeatable.")
+    prior: tuple[str, ...] = declare(
+        ("bundled",), "Prior that visitors may choose; repeat it to offer several."
+    )
     device: str = declare("auto", help_of("device"))
     host: str = declare("127.0.0.1", "Address to listen on; 0.0.0.0 lets other machines in.")
-    port: int | None = declare(None, "Port; by default the first free one.", low=1, high=65535)
+    port: int | None = declare(None, "Port (default: the first free one).", low=1, high=65535)
     browser: bool = declare(False, "Open the page in a browser.")
 
 
@@ -114,26 +121,28 @@ class _Page:
 class _Convert:
     paths: tuple[Path, ...] = declare(
         MISSING,
-        "SRC: checkpoint (.ckpt, .pth) or a folder of .bin weights. BASE: Qwen-Image-Edit-2509; CHECKPOINT: "
-        "its trainables.safetensors. DST: the folder to appear, for --prior.",
+        "SRC is a checkpoint (.ckpt, .pth) or a folder of .bin weights. For Marigold V2 BASE is a folder of "
+        "Qwen-Image-Edit-2509 and CHECKPOINT its trainables.safetensors. DST is the new folder, for --prior.",
         "",
         metavar="SRC DST | marigold-v2 BASE CHECKPOINT DST",
     )
-    part: str | None = declare(None, "File, folder or hub id of what SRC lacks (priors.md).", "--with")
-    space: str | None = declare(None, "marigold-v2: space of its map.", choices=SPACES)
+    part: str | None = declare(
+        None, "What SRC lacks: a file, folder or hub id (docs/reference/priors.md).", "--with"
+    )
+    space: str | None = declare(None, "What the map of marigold-v2 is affine in.", choices=SPACES)
 
 
 COMMANDS = {
-    "depth": Command(DepthOptions, _depth, "Metric depth of LEFT guided by RIGHT; of one pair, or of many."),
-    "capture": Command(CaptureOptions, _capture, "Depth of a capture's frames, and one cloud of all."),
-    "demo": Command(_Demo, _Demo.run, "Run on a rendered pair of the package, and print how good it is."),
-    "info": Command(_Info, _later("cli.info.run_info"), "Versions, devices, priors and what is cached."),
-    "bench": Command(PriorOptions, _later("cli.demo.run_bench"), "What guidance costs in seconds."),
-    "video": Command(_Video, _later("cli.results.run_video"), "Join depth maps of a sequence into a video."),
-    "submit": Command(_Submit, _later("cli.results.run_submit"), "Write files for Middlebury and ETH3D."),
-    "app": Command(_Page, _later("app.launch.run_app"), "Serve a web page to measure on (extra app)."),
-    "convert": Command(_Convert, _later("cli.results.run_convert"), "Convert weights to a --prior folder."),
-    "eval": Command(None, lambda _: _imported("cli.eval.eval_app"), "Measure it and others on data sets."),
+    "depth": Command(DepthOptions, _depth, "Metric depth of LEFT, guided by RIGHT: one pair, or many."),
+    "capture": Command(CaptureOptions, _capture, "Metric depth of the frames of a capture, and one cloud."),
+    "demo": Command(_Demo, _Demo.run, "Run on the bundled pair, and compare with its true depth."),
+    "info": Command(_Info, _later("cli.info.run_info"), "Show versions, devices and priors."),
+    "bench": Command(PriorOptions, _later("cli.demo.run_bench"), "Measure how much time guidance adds."),
+    "video": Command(_Video, _later("cli.results.run_video"), "Join the depth maps of frames into a video."),
+    "submit": Command(_Submit, _later("cli.results.run_submit"), "Write results for Middlebury or ETH3D."),
+    "app": Command(_Page, _later("app.launch.run_app"), "Serve a page for measuring (extra 'app')."),
+    "convert": Command(_Convert, _later("cli.results.run_convert"), "Make a folder for --prior of weights."),
+    "eval": Command(None, lambda _: _imported("cli.eval.eval_app"), "Evaluate it and others on data sets."),
 }
 ABOUT = "Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior."
 app = new_group(ABOUT, COMMANDS, outermost=True)

@@ -6,6 +6,7 @@ import dataclasses
 import sys
 from collections.abc import Mapping
 from inspect import Parameter, Signature
+from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
@@ -22,6 +23,8 @@ APPEARANCE: dict[str, Any] = {
     "pretty_exceptions_enable": False,
     "context_settings": {"help_option_names": ["-h", "--help"]},
 }
+#: What help calls the values of an option.
+METAVARS = {bool: "", Path: "PATH", int: "NUMBER", float: "NUMBER"}
 
 
 class _Group(TyperGroup):
@@ -84,13 +87,20 @@ def _parameter(field: dataclasses.Field[Any], kind: Any) -> Parameter:
     elif get_origin(kind) is tuple:
         kind = list[get_args(kind)[0]]  # type: ignore[misc]
         kind, default = (kind, default) if required else (kind | None, list(default) or None)
-    flags, about = rules["flags"] or (flag_of(field),), {"metavar": rules["metavar"], "help": rules["help"]}
+    flags, metavar = rules["flags"] or (flag_of(field),), rules["metavar"]
+    about = {"metavar": _metavar(kind) if metavar is None else metavar, "help": rules["help"]}
     if flags == ("",):
         typed: Any = typer.Argument(**about)
     else:
         typed = typer.Option(*flags, **about, rich_help_panel=rules["panel"] or None)
     default = Parameter.empty if required else default
     return Parameter(field.name, Parameter.KEYWORD_ONLY, annotation=Annotated[kind, typed], default=default)
+
+
+def _metavar(kind: Any) -> str:
+    """What an option takes, in a word; nothing for one that is switched on."""
+    kinds = {kind, *get_args(kind), *(inner for each in get_args(kind) for inner in get_args(each))}
+    return next((word for name, word in METAVARS.items() if name in kinds), "TEXT")
 
 
 def _value(field: dataclasses.Field[Any], value: Any, kind: Any) -> Any:

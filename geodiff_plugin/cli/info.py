@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import wrap
 
 import torch
 from huggingface_hub import CacheNotFound, scan_cache_dir
 
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin.bundled import no_bars
+from geodiff_plugin._checks import refuse
 from geodiff_plugin.cli.terminal import print_lines
 from geodiff_plugin.config import knob_lines
 from geodiff_plugin.priors import PRIORS, PriorSource, find_prior, prior_of
+from geodiff_plugin.priors.loading import no_bars
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runtime.machine import versions
+
+#: Characters of a value, so that a line with its name fits 80.
+LINE_WIDTH = 62
 
 
 def _describe(source: PriorSource, space: str | None) -> list[tuple[str, str]]:
@@ -48,7 +52,7 @@ def run_info(prior: str | None, space: str | None, knobs: bool) -> None:
         print("\n".join(knob_lines()))
         return
     if space is not None and prior is None:
-        bad_value("--space", "given with --prior, the prior that it describes", repr(space))
+        refuse("--space needs --prior: it describes that prior.")
     described = []
     if prior is not None:
         with no_bars():
@@ -63,5 +67,6 @@ def run_info(prior: str | None, space: str | None, knobs: bool) -> None:
     except CacheNotFound:
         models = []
     cached = sorted(f"{repo.repo_id} ({repo.size_on_disk / 1e6:.1f} MB)" for repo in models)
-    rows += [("adapters", ", ".join(PRIORS)), *(("cached", line) for line in cached or ["nothing"])]
+    rows += [("adapters", line) for line in wrap(", ".join(PRIORS), LINE_WIDTH)]
+    rows += [("cached", line) for line in cached or ["nothing"]]
     print_lines([*rows, ("package", str(Path(__file__).resolve().parents[1])), *described])

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin._checks import InputError, bad_value, refuse
 from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.evidence.store import EvidenceStore
@@ -230,8 +230,8 @@ def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
     given = [] if options.baseline is None or len(refs) < 2 else [options_of(ref, options) for ref in refs]
     for calib in dict.fromkeys(each.calib for each in given if each.calib):
         if has_pose_per_image(calib if len(calib) > 1 else calib[0]):
-            cure = "Every pair has its own. Give the model's scale: geodiff capture MODEL --known-length."
-            bad_value("--baseline", "left out with many pairs of one model", str(calib[0]), cure)
+            each = f"every pair of {calib[0]} has a baseline of its own"
+            refuse(f"--baseline cannot be used here: {each}. Try geodiff capture MODEL --known-length.")
 
 
 def depth_pairs(

@@ -10,7 +10,7 @@ from dataclasses import MISSING, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, refuse
 from geodiff_plugin.capture import NEIGHBOURS, POINTS
 from geodiff_plugin.formats.files import check_file, open_image
 from geodiff_plugin.formats.out import OutFolder, free_folder
@@ -42,55 +42,118 @@ def told_apart(paths: Collection[Path]) -> list[str]:
     return [path.relative_to(common).as_posix() for path in absolute]
 
 
+@dataclass(frozen=True)
+class _Exclusion:
+    """Options that cannot be given where ``holds``; ``{}`` in the sentence stands for the one that was."""
+
+    holds: bool
+    options: tuple[str, ...]
+    sentence: str
+
+
 @dataclass(frozen=True, kw_only=True)
 class DepthOptions(RunOptions):
     """The options of ``geodiff depth`` as they were typed."""
 
     left: Path = declare(
-        MISSING, "Left image, or folder, video, bag, list (LEFT,RIGHT[,CALIB] a line).", "", metavar="LEFT"
+        MISSING,
+        "Left image, which gets the depth. For many pairs: a folder, a video, a bag, or a list with "
+        "LEFT,RIGHT[,CALIB] on each line.",
+        "",
+        metavar="LEFT",
     )
     right: Path | None = declare(
-        None, "Right image, folder or video; none with --points, or if a video has both.", "", metavar="RIGHT"
+        None,
+        "Right image, folder or video. Leave it out with --points, or where one video shows both views side "
+        "by side.",
+        "",
+        metavar="RIGHT",
     )
-    calib: tuple[Path, ...] = _camera((), "Calibration file, or COLMAP folder; twice for one a view.")
-    cameras: str | None = _camera(None, "Which two cameras of a file that has more, as 2,3.")
-    fx: float | None = _camera(None, "Focal length, pixels.")
-    fy: float | None = _camera(None, "Focal length, pixels.")
-    cx: float | None = _camera(None, "Principal point, pixels.")
-    cy: float | None = _camera(None, "Principal point, pixels.")
-    baseline: float | None = _camera(None, "Metres between cameras; replaces --calib's.", above_0="metres")
-    cx_right: float | None = _camera(None, "cx of the right camera of a rectified pair; --cx if none.")
-    k: Path | None = _camera(None, "3x3 intrinsics, text or .npy.", "--K")
-    e: Path | None = _camera(None, "4x4 pose of the right camera in the left one's frame, metres.", "--E")
-    k_right: Path | None = _camera(None, "3x3 intrinsics of the right image, if they differ.", "--K-right")
-    distortion: tuple[str, ...] = _camera((), "Lens: k1,k2,p1,p2[,k3...] or fisheye:k1,...,k4; one or two.")
-    estimate_pose: bool = _camera(False, "Find the poses from the photographs (needs the extra pose).")
-    fov: float | None = _camera(None, "Horizontal field of view, degrees, if EXIF has no focal length.")
-    known_length: str | None = _camera(None, "A distance in LEFT, X1,Y1,X2,Y2,METRES; instead of --baseline.")
-    view: tuple[Path, ...] = _camera((), "A further view, with --view-E; repeat both for each.")
-    view_k: tuple[Path, ...] = _camera((), "3x3 intrinsics of each --view; LEFT's if none.", "--view-K")
-    view_e: tuple[Path, ...] = _camera((), "4x4 pose of each --view in the left camera's frame.", "--view-E")
-    view_distortion: tuple[str, ...] = _camera((), "Lens of each --view, 0,0,0,0 for none; default LEFT's.")
-    cropped: bool = _camera(False, "The principal point may lie outside: the images are crops.")
-    prior_map: Path | None = declare(None, "Another model's map of LEFT (or folder of maps) as the prior.")
-    points: Path | None = declare(None, "Known depths: a map of LEFT, or points (.npy, text, .ply).")
-    points_scale: float | None = declare(None, "Units per metre, of --disparity per pixel.", above_0="units")
-    disparity: Path | None = declare(None, "Disparities of LEFT in a rectified rig, instead of --points.")
-    points_confidence: Path | None = declare(None, "Confidence of each known depth, [0, 1], same shape.")
-    topic_left: str | None = declare(None, "Topic of the left images, where LEFT is a bag.", "--left")
-    topic_right: str | None = declare(None, "Topic of the right images, where LEFT is a bag.", "--right")
-    tolerance: float = declare(0.005, "A bag: most seconds between the stamps of a pair.", low=0.0, high=10.0)
-    encoding: str = _output("16UC1", "A bag: 16UC1 is whole mm, 32FC1 metres.", choices=("16UC1", "32FC1"))
-    steady: bool = _output(False, "Average each frame with its neighbours where they agree; frames in order.")
-    min_confidence: float = _output(0.0, "Least confidence of a point in the cloud, 0 to 1.", low=0, high=1)
-    out: Path | None = _output(None, "Folder; geodiff-out, or -2 and so on if taken.", "--out", "-o")
-    overwrite: bool = _output(False, "Write into a folder that holds files; do finished pairs anew.")
-    strict: bool = _output(False, "End with an error unless the result is trusted.")
+    calib: tuple[Path, ...] = _camera(
+        (), "Calibration file or COLMAP folder; repeat it for one file per view."
+    )
+    cameras: str | None = _camera(None, "Two cameras of a calibration file that has more, left first: 2,3.")
+    fx: float | None = _camera(None, "Focal length along x in pixels.")
+    fy: float | None = _camera(None, "Focal length along y in pixels.")
+    cx: float | None = _camera(None, "Principal point in pixels from the left edge.")
+    cy: float | None = _camera(None, "Principal point in pixels from the top edge.")
+    baseline: float | None = _camera(
+        None, "Distance between the cameras in metres; replaces that of --calib.", above_0="metres"
+    )
+    cx_right: float | None = _camera(
+        None, "cx of the right camera of a rectified pair, where it differs from --cx."
+    )
+    k: Path | None = _camera(None, "Intrinsics of the left camera: a 3x3 matrix as text or .npy.", "--K")
+    e: Path | None = _camera(
+        None, "Pose of the right camera in the left camera's frame: a 4x4 matrix in metres.", "--E"
+    )
+    k_right: Path | None = _camera(
+        None, "Intrinsics of the right camera, where they differ from --K.", "--K-right"
+    )
+    distortion: tuple[str, ...] = _camera(
+        (),
+        "Lens distortion: k1,k2,p1,p2[,k3...] or fisheye:k1,k2,k3,k4; repeat it where the right lens "
+        "differs.",
+    )
+    estimate_pose: bool = _camera(False, "Estimate the poses from the photographs (needs the extra 'pose').")
+    fov: float | None = _camera(None, "Horizontal field of view in degrees, where EXIF has no focal length.")
+    known_length: str | None = _camera(
+        None,
+        "Instead of --baseline: two pixels of LEFT and the distance between the places that they show, as "
+        "X1,Y1,X2,Y2,METRES.",
+    )
+    view: tuple[Path, ...] = _camera((), "A further view of the scene, with its --view-E; repeat both.")
+    view_k: tuple[Path, ...] = _camera((), "Intrinsics of each --view (default: those of LEFT).", "--view-K")
+    view_e: tuple[Path, ...] = _camera(
+        (), "Pose of each --view in the left camera's frame: a 4x4 matrix in metres.", "--view-E"
+    )
+    view_distortion: tuple[str, ...] = _camera(
+        (), "Lens distortion of each --view; 0,0,0,0 for none (default: that of LEFT)."
+    )
+    cropped: bool = _camera(False, "Allow a principal point outside the image, as crops may have.")
+    prior_map: Path | None = declare(
+        None, "Take another model's depth map of LEFT, or a folder of maps, as the prior."
+    )
+    points: Path | None = declare(
+        None, "Known depths in metres: a depth map of LEFT, or points (.npy, text, .ply)."
+    )
+    points_scale: float | None = declare(
+        None, "Units per metre of --points (1000: millimetres), or per pixel of --disparity.", above_0="units"
+    )
+    disparity: Path | None = declare(
+        None, "Known disparities of LEFT in a rectified rig, instead of --points."
+    )
+    points_confidence: Path | None = declare(
+        None, "Confidence of each known depth, 0 to 1, as an array of the same shape."
+    )
+    topic_left: str | None = declare(None, "In a bag: the topic of the left images.", "--left")
+    topic_right: str | None = declare(None, "In a bag: the topic of the right images.", "--right")
+    tolerance: float = declare(
+        0.005, "In a bag: the largest time between the two images of a pair, in seconds.", low=0.0, high=10.0
+    )
+    encoding: str = _output(
+        "16UC1",
+        "In a bag: depth as 16UC1 (whole millimetres) or 32FC1 (metres).",
+        choices=("16UC1", "32FC1"),
+    )
+    steady: bool = _output(False, "Average the depth of consecutive frames where they agree.")
+    min_confidence: float = _output(
+        0.0, "Leave points of lower confidence out of the cloud, 0 to 1.", low=0, high=1
+    )
+    out: Path | None = _output(
+        None, "Output folder (default: geodiff-out, with a number if that exists).", "--out", "-o"
+    )
+    overwrite: bool = _output(
+        False, "Write into a folder that holds files, and compute finished pairs again."
+    )
+    strict: bool = _output(False, "Fail unless the result is trusted.")
     export: tuple[str, ...] = _output(
-        (), "Also glb (cloud), mesh (textured, GLB) or colmap; repeatable.", choices=("glb", "mesh", "colmap")
+        (),
+        "Also write glb (point cloud), mesh (textured GLB) or colmap (sparse model); repeatable.",
+        choices=("glb", "mesh", "colmap"),
     )
-    quiet: bool = _output(False, "No progress bar, no summary.", "--quiet", "-q")
-    json: bool = _output(False, "Print the report instead of the summary.")
+    quiet: bool = _output(False, "Show no progress bar and no summary.", "--quiet", "-q")
+    json: bool = _output(False, "Print the report as JSON instead of the summary.")
 
     def __post_init__(self) -> None:
         if self.prior_map is not None and self.prior == "bundled":  # the default, which the map replaces
@@ -116,20 +179,18 @@ class DepthOptions(RunOptions):
         paths = [*self.photographs().values(), *(path for _, path in self.other_files())]
         return [f for p in paths for f in ([p / name for name in MODEL_FILES] if p.is_dir() else [p])]
 
-    def refuse(self, names: Iterable[str], expected: str, got: str = "", cure: str = "") -> None:
-        """Refuse the first option of these that was given, by its value if not by ``got``."""
+    def refuse(self, names: Iterable[str], sentence: str) -> None:
+        """Refuse the first of these options that was given; ``{}`` in the sentence stands for its flag."""
         for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in names and value != field.default:
-                got = got or (value[0] if isinstance(value, tuple) else value)
-                bad_value(flag_of(field), expected, got, cure)
+            if field.name in names and getattr(self, field.name) != field.default:
+                refuse(sentence.format(flag_of(field)))
 
     def bag_topics(self) -> tuple[str, str]:
         """The topics of ``--left`` and ``--right``."""
-        self.refuse(["right"], "left out where LEFT is a bag", cure="Name the topics: --left, --right.")
+        self.refuse(["right"], "{} is given, but LEFT is a bag: name its topics by --left and --right.")
         for flag, topic in (("--left", self.topic_left), ("--right", self.topic_right)):
             if topic is None:
-                bad_value(flag, "given as a topic of images, as LEFT is a bag", "nothing")
+                refuse(f"{flag} is missing: name the topics of the images of a bag by --left and --right.")
         return str(self.topic_left), str(self.topic_right)
 
     def camera_pair(self) -> tuple[int, int] | None:
@@ -146,15 +207,16 @@ class DepthOptions(RunOptions):
         """``check``, and what options exclude or need each other; knobs are checked when torch is there."""
         self.check()
         self.camera_pair()
-        for holds, names, expected, got, cure in self._excluded():
-            if holds:
-                self.refuse(names.split(), expected, got, cure)
-        if (self.prior == "map") != (self.prior_map is not None):
-            beside = "no --prior-map" if self.prior_map is None else "--prior-map"
-            bad_value("--prior-map", "given in place of a --prior", f"--prior {self.prior} and {beside}")
+        for rule in self._exclusions():
+            if rule.holds:
+                self.refuse(rule.options, rule.sentence)
+        if self.prior == "map" and self.prior_map is None:
+            refuse("--prior map needs --prior-map.")
+        if self.prior != "map" and self.prior_map is not None:
+            refuse(f"--prior-map takes the place of a prior: leave out --prior {self.prior}.")
         if self.right is None and self.points is None and self.disparity is None:
-            cure = "One photograph alone does not tell metres."
-            bad_value("RIGHT", "given, or --points instead of it", "neither", cure)
+            alone = "One photograph alone does not tell metres"
+            refuse(f"RIGHT is missing. {alone}: give a second view, or known depths by --points.")
         views = len(self.view)
         for option, given, counts in (
             ("--view-E", self.view_e, {0 if self.estimate_pose else views}),
@@ -162,30 +224,37 @@ class DepthOptions(RunOptions):
             ("--view-distortion", self.view_distortion, {0, views}),
         ):
             if len(given) not in counts:
-                bad_value(option, f"given once for each of {views} --view", f"{len(given)} times")
+                times = f"{len(given)} times for {views} --view"
+                refuse(f"{option} is given {times}: give it once for each.")
 
-    def _excluded(self) -> list[tuple[bool, str, str, str, str]]:
-        """Rows: the condition, the options that it forbids, and the message's expected, got and cure."""
+    def _exclusions(self) -> list[_Exclusion]:
+        """Which options the others forbid."""
         alone, no_points, no_disparity = (v is None for v in (self.right, self.points, self.disparity))
         paper, posed = self.preset == "paper", not self.estimate_pose
-        default = "given with the default preset", "--preset paper"
-        together = "given together with --estimate-pose", "no --estimate-pose"
-        known = "Poses are given or estimated. For K alone give --K, or --fx --fy --cx --cy."
-        second = "given with RIGHT", "no RIGHT", "It belongs to a second view."
-        of_file = "given with --calib only", "no --calib", "It chooses among the cameras of a file."
-        of_depths = "given with --points or --disparity", "neither", ""
+        with_poses = "{} cannot be used with --estimate-pose"
+        for_k = "which finds the poses itself. For K alone give --K, or --fx --fy --cx --cy."
+        second = "{} needs RIGHT: it belongs to a second view."
         return [
-            (paper, "points disparity", *default, "Algorithm 1 has no points."),
-            (paper, "view", *default, "Algorithm 1 has two views."),
-            (posed, "fov known_length", *together, ""),
-            (not posed, "calib cameras e view_e cx_right", "left out with --estimate-pose", "both", known),
-            (not posed, "steady", "left out with --estimate-pose", "both", "Each pair has its scale."),
-            (not self.calib, "cameras", *of_file),
-            (no_points and no_disparity, "points_scale", *of_depths),
-            (not no_points, "disparity", "given in place of --points", "both", ""),
-            (no_points and no_disparity, "points_confidence", *of_depths),
-            (alone and no_disparity, "baseline cx_right", *second),
-            (alone, "e k_right view estimate_pose", *second),
+            _Exclusion(
+                paper,
+                ("points", "disparity"),
+                "{} cannot be used with --preset paper: Algorithm 1 has no known depths.",
+            ),
+            _Exclusion(paper, ("view",), "{} cannot be used with --preset paper: Algorithm 1 has two views."),
+            _Exclusion(posed, ("fov", "known_length"), "{} needs --estimate-pose."),
+            _Exclusion(not posed, ("calib", "cameras", "e", "view_e", "cx_right"), f"{with_poses}, {for_k}"),
+            _Exclusion(not posed, ("steady",), f"{with_poses}: every pair has a scale of its own."),
+            _Exclusion(
+                not self.calib, ("cameras",), "{} needs --calib: it chooses among the cameras of a file."
+            ),
+            _Exclusion(not no_points, ("disparity",), "{} cannot be used with --points: give one of them."),
+            _Exclusion(
+                no_points and no_disparity,
+                ("points_scale", "points_confidence"),
+                "{} needs --points or --disparity.",
+            ),
+            _Exclusion(alone and no_disparity, ("baseline", "cx_right"), second),
+            _Exclusion(alone, ("e", "k_right", "view", "estimate_pose"), second),
         ]
 
     def cameras_way(self) -> str:
@@ -204,20 +273,19 @@ class DepthOptions(RunOptions):
         if self.estimate_pose:
             known = f"{matrices}, or {numbers}, or --fov, or EXIF"
         if len(taken) > 1:
-            what = "K" if self.estimate_pose else "calibration"
-            bad_value(what, f"given in one way: {known}", " and ".join(taken), "Drop the others.")
+            what = "K is" if self.estimate_pose else "The cameras are"
+            refuse(f"{what} given in several ways, by {' and '.join(taken)}. Give one of: {known}.")
         if not taken and not self.estimate_pose:
-            cure = "Without cameras two images do not tell metres."
-            bad_value("calibration", f"given: {known}", "none", cure)
+            refuse(f"The cameras are missing. Give {known}: without them two images do not tell metres.")
         way = taken[0] if taken else "EXIF"
         missing = [_flag(name) for name in needed.get(way, ()) if getattr(self, name) is None]
         if missing:
             names = dict.fromkeys((*needed[way], *WAYS[way]))
             there = " ".join(_flag(name) for name in names if name in given)
-            bad_value(" ".join(missing), f"given as well, with {there}", "nothing")
+            refuse(f"With {there} give {' '.join(missing)} as well.")
         if self.estimate_pose and self.cropped and way in ("--fov", "EXIF") and not self.view_k:
-            cure = "A field of view, or EXIF, does not tell where the principal point of a crop is."
-            bad_value("--cropped", "given with --K, or --fx --fy --cx --cy", f"K by {way}", cure)
+            why = f"{way} does not tell where the principal point of a crop is"
+            refuse(f"--cropped needs --K, or --fx --fy --cx --cy: {why}.")
         return way
 
 
@@ -264,37 +332,57 @@ class CaptureOptions(PriorOptions):
 
     path: Path = declare(
         MISSING,
-        "COLMAP model, transforms.json (nerfstudio, Polycam, Record3D, instant-ngp) or its folder, "
-        "folder of 7-Scenes, ScanNet or TUM RGB-D, video with --trajectory, or folder of images.",
+        "A COLMAP model; a transforms.json (nerfstudio, Polycam, Record3D, instant-ngp) or its folder; a "
+        "folder of 7-Scenes, ScanNet or TUM RGB-D; a video with --trajectory; or a folder of images.",
         "",
         metavar="PATH",
     )
-    out: Path = _output(Path("geodiff-capture"), "Folder for the results, one folder a frame.", "--out", "-o")
-    frames: str | None = declare(None, "Which get depth: NAME,NAME or FIRST:LAST:STEP; all by default.")
-    neighbours: int = declare(NEIGHBOURS, "Right views of a frame, at most.", low=1, high=32)
-    poses: str = _camera("refined", "refined (solved together) or given.", choices=("refined", "given"))
+    out: Path = _output(
+        Path("geodiff-capture"), "Output folder, with one folder for each frame.", "--out", "-o"
+    )
+    frames: str | None = declare(None, "Frames that get depth: NAME,NAME or FIRST:LAST:STEP (default: all).")
+    neighbours: int = declare(NEIGHBOURS, "Largest number of right views of a frame.", low=1, high=32)
+    poses: str = _camera(
+        "refined", "refined (all solved together) or given (used as they are).", choices=("refined", "given")
+    )
     points: str = declare(
         "tracks",
-        "Known depths: tracks (pose solve), none, model (COLMAP), depth (maps).",
+        "Known depths: tracks (points of the pose solve), model (points of a COLMAP model), depth (depth "
+        "maps of the capture) or none.",
         choices=POINTS,
     )
-    metres_per_unit: float | None = _camera(None, "Metres of a unit of the poses.", above_0="metres")
-    known_length: str | None = _camera(None, "A distance in a frame, NAME:X1,Y1,X2,Y2,METRES by its pixels.")
-    distance: str | None = _camera(None, "Distance of two cameras, NAME,NAME,METRES.")
-    k: Path | None = _camera(None, "3x3 intrinsics, text or .npy.", "--K")
-    fov: float | None = _camera(None, "Horizontal field of view, degrees.")
-    trajectory: Path | None = _camera(None, "Of a video: lines of seconds tx ty tz qx qy qz qw (TUM's).")
-    prior_map: Path | None = declare(None, "Folder of another model's maps, NAME.npy, in place of a prior.")
-    processes: int | None = declare(None, "Processes; by default one a core.", low=1, high=1024)
-    export: tuple[str, ...] = _output((), "colmap (workspace), mesh (TSDF).", choices=("colmap", "mesh"))
-    overwrite: bool = _output(False, "Write into a folder that holds files; do finished frames anew.")
+    metres_per_unit: float | None = _camera(None, "Metres per unit of the poses.", above_0="metres")
+    known_length: str | None = _camera(
+        None,
+        "Two pixels of a frame and the distance between the places that they show, as "
+        "NAME:X1,Y1,X2,Y2,METRES.",
+    )
+    distance: str | None = _camera(
+        None, "Two frames and the distance between their cameras, as NAME,NAME,METRES."
+    )
+    k: Path | None = _camera(None, "Intrinsics of all frames: a 3x3 matrix as text or .npy.", "--K")
+    fov: float | None = _camera(None, "Horizontal field of view in degrees.")
+    trajectory: Path | None = _camera(
+        None, "Poses of a video in TUM's form: 'seconds tx ty tz qx qy qz qw' on each line."
+    )
+    prior_map: Path | None = declare(
+        None, "Take another model's depth maps as the prior: a folder with NAME.npy for each frame."
+    )
+    processes: int | None = declare(None, "Number of processes (default: one per core).", low=1, high=1024)
+    export: tuple[str, ...] = _output(
+        (),
+        "Also write colmap (dense workspace) or mesh (TSDF fusion, needs Open3D); repeatable.",
+        choices=("colmap", "mesh"),
+    )
+    overwrite: bool = _output(
+        False, "Write into a folder that holds files, and compute finished frames again."
+    )
     strict: bool = _output(False, "End with exit code 4 unless every frame is trusted.")
-    quiet: bool = _output(False, "No progress bar.", "--quiet", "-q")
-    json: bool = _output(False, "Print the report instead of a summary.")
+    quiet: bool = _output(False, "Show no progress bar.", "--quiet", "-q")
+    json: bool = _output(False, "Print the report as JSON instead of the summary.")
 
     def __post_init__(self) -> None:
         check_options(self)
-        if sum(getattr(self, way) is not None for way in OF_SCALE) > 1:
-            bad_value(
-                "the scale", "given in one way", "more of --metres-per-unit, --known-length, --distance"
-            )
+        given = [f"--{way.replace('_', '-')}" for way in OF_SCALE if getattr(self, way) is not None]
+        if len(given) > 1:
+            refuse(f"The scale is given in several ways, by {' and '.join(given)}. Give one of them.")

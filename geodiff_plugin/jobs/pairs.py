@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, refuse
 from geodiff_plugin.formats.files import MAP_SUFFIXES, check_file, find_map, natural_order
 from geodiff_plugin.formats.out import check_out
 from geodiff_plugin.formats.recordings import VIDEOS, is_bag, is_video, list_pairs, video_facts
@@ -53,15 +53,14 @@ def start_many(options: DepthOptions, tell: Tell = silent) -> list[PairRef]:
     ``options.left`` is a folder, a list, a video or a bag; ``tell`` hears how pairs were assumed to belong.
     """
     names = ("points", "disparity", "view", "known_length")
-    options.refuse(names, "left out with many pairs", cure="It belongs to one pair.")
+    options.refuse(names, "{} belongs to one pair: leave it out with many.")
     refs = find_pairs(options, tell)
     each = [options_of(ref, options) for ref in refs]  # every pair has its map
     if refs[0].frame is not None:
-        cure = "Extract some frames, and try it there."
-        options.refuse(["estimate_pose"], "left out with a video", "given", cure)
+        options.refuse(["estimate_pose"], "{} does not take a video: extract some frames first.")
         if "colmap" in options.export:
-            cure = "A model names image files: extract the frames, and give their folders."
-            bad_value("--export colmap", "left out with a video", "given", cure)
+            cure = "extract the frames, and give their folders"
+            refuse(f"--export colmap does not take a video, as a model names image files: {cure}.")
     first = replace(each[0], right=refs[0].right or refs[0].left)  # one video may have both views
     first.check_all()
     if options.estimate_pose or all(ref.calib is None for ref in refs):
@@ -114,8 +113,8 @@ def _photographs(folder: Path) -> list[Path]:
 def _of_folders(left: Path, right: Path | None) -> tuple[list[PairRef], Message | None]:
     """The pairs, and what was assumed of them."""
     if right is None or not os.path.isdir(right):
-        got = "nothing" if right is None else right
-        bad_value("RIGHT", "a folder where LEFT is one", got, "Or let LEFT be an image, or a list of pairs.")
+        given = "RIGHT is missing" if right is None else f"RIGHT is no folder ({right})"
+        refuse(f"{given}, but LEFT is a folder. Give two folders, two images, or a list of pairs.")
     lefts, rights = _photographs(left), _photographs(right)
     for name, folder, paths in (("LEFT", left, lefts), ("RIGHT", right, rights)):
         if not paths:
@@ -131,9 +130,9 @@ def _of_folders(left: Path, right: Path | None) -> tuple[list[PairRef], Message 
         sentence = f"The two folders share no name, so images are paired in order: {first} to {last}."
         return [PairRef(a.stem, a, b) for a, b in pairs], Message("pairs.in-order", sentence)
     if alone := {path.stem for path in lefts} ^ set(of_stem):
-        cure = "Remove it, or write a list of pairs: LEFT,RIGHT[,CALIB] a line."
-        got = f"{len(lefts)} left and {len(rights)} right images; {min(alone)} has no partner"
-        bad_value("LEFT and RIGHT", "folders of images with the same names, or as many in order", got, cure)
+        counts = f"{len(lefts)} left and {len(rights)} right images"
+        cure = "Remove it, or write a list of pairs with LEFT,RIGHT[,CALIB] on each line."
+        refuse(f"{min(alone)} has no partner: LEFT and RIGHT hold {counts}. {cure}")
     return [PairRef(path.stem, path, of_stem[path.stem]) for path in lefts], None
 
 
@@ -145,8 +144,8 @@ def _of_videos(left: Path, right: Path | None) -> tuple[list[PairRef], Message |
     if not is_video(right):
         bad_value("RIGHT", f"a video too ({', '.join(VIDEOS)}), or left out", right)
     if (others := video_facts(right, "RIGHT")[0]) != frames:
-        cure = "Cut them to the same moments first."
-        bad_value("RIGHT", f"a video of {frames} frames, as the left one", f"{others} frames", cure)
+        counts = f"LEFT has {frames} frames and RIGHT {others}"
+        refuse(f"{counts}. Cut both videos to the same moments first.")
     return _frames(frames, left, right), None
 
 
@@ -157,8 +156,9 @@ def _frames(count: int, left: Path, right: Path | None) -> list[PairRef]:
 
 def _of_list(path: Path, right: Path | None) -> list[PairRef]:
     if right is not None:
-        cure = f"{path.name} is a text, so it is read as a list, which names both views of each pair."
-        bad_value("RIGHT", "left out where LEFT is a list of pairs", right, cure)
+        refuse(
+            f"RIGHT ({right}) is given, but LEFT ({path.name}) is a list, which names both views of pairs."
+        )
     file = check_file(path, "LEFT", "a list of pairs")
     try:
         text = file.read_text(encoding="utf-8-sig")
@@ -172,10 +172,11 @@ def _of_list(path: Path, right: Path | None) -> list[PairRef]:
             continue
         if len(cells) not in (2, 3):
             got = repr(" ".join(cells))
-            bad_value(f"line {number} of {path}", "LEFT,RIGHT[,CALIB], by commas or tabs", got)
+            expected = "LEFT,RIGHT[,CALIB], separated by commas or tabs"
+            bad_value(f"line {number} of {path}", expected, got)
         rows.append([file.parent / cell for cell in cells])
     if not rows:
-        bad_value("LEFT", "a list with a pair a line: LEFT,RIGHT[,CALIB]", f"{path}, which names none")
+        refuse(f"LEFT ({path}) is a list without pairs: write LEFT,RIGHT[,CALIB] on each line.")
     counts, refs = Counter[str](), list[PairRef]()
     for name, row in zip(told_apart([row[0] for row in rows]), rows, strict=True):
         stem = Path(name).with_suffix("").as_posix().replace("/", "_")

@@ -10,10 +10,10 @@ from typing import Any
 import torch
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.bundled import no_bars
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.telling import Tell
 from geodiff_plugin.priors import find_prior
+from geodiff_plugin.priors.loading import no_bars
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
@@ -42,8 +42,9 @@ def load_guided_prior(
     on_disk = name == "bundled" or os.path.isdir(name) or os.path.isdir(name.partition(":")[2])
     with no_bars() if on_disk or tell is None else nullcontext():
         prior = find_prior(name)
-        if tell is not None:
-            tell(f"prior: {name} ({prior.key}; {prior.licence})")
+    if tell is not None:
+        tell(f"prior: {name} ({prior.key}; {prior.licence})")
+    with no_bars():
         pipe = prior.load(device, getattr(torch, dtype), space)
     taken = pipe.call_options() if isinstance(pipe, DepthDiffusionPipeline) else []
     for entry in options:

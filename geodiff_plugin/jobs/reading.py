@@ -16,7 +16,7 @@ from geodiff_plugin._camera_checks import (
     check_intrinsics_fit,
     check_pose,
 )
-from geodiff_plugin._checks import bad_value, warn
+from geodiff_plugin._checks import bad_value, refuse, warn
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.guidance import GeometryGuidance, assume_same_centre
 from geodiff_plugin.evidence.prepare import cleaned
@@ -232,7 +232,7 @@ def _read_known(
     """
     if options.disparity is not None:
         if rig is None:
-            bad_value("--disparity", "of a rectified rig with a calibration", "--estimate-pose")
+            refuse("--disparity needs a calibrated rectified rig: it cannot be used with --estimate-pose.")
         per_px = options.points_scale
         return depth_of_disparity(options.disparity, rig, size, "--disparity", per_px=per_px)
     if options.points is None:
@@ -265,19 +265,19 @@ def lenses_of(options: DepthOptions, rig: Rig | None = None) -> tuple[Distortion
     """
     typed = [distortion_from_text(text) for text in options.distortion]
     if len(typed) > 2:
-        bad_value("--distortion", "given once for both lenses, or twice", f"{len(typed)} times")
+        refuse(f"--distortion is given {len(typed)} times: give it once for both lenses, or once for each.")
     if rig is not None and rig.rectified and any(is_distorted(lens) for lens in typed):
-        expected = f"left out where the calibration is of rectified images ({rig.source})"
+        rectified = f"--distortion is given, but {rig.source} is for rectified images"
         cure = "Give the rectified images; or the raw ones, with their cameras as --K, --K-right and --E."
-        bad_value("--distortion", expected, " and ".join(options.distortion), cure)
+        refuse(f"{rectified}. {cure}")
     pair = (typed[0], typed[-1]) if typed else (None, None) if rig is None else rig.distortion
     further = [distortion_from_text(text, "--view-distortion") for text in options.view_distortion]
     if options.view_k and not further and any(is_distorted(lens) for lens in pair):
-        cure = "A view with a K of its own has a lens of its own: 0,0,0,0 says that it is straight."
-        bad_value("--view-distortion", "given for each --view", "none", cure)
+        cure = "give the lens of each by --view-distortion, 0,0,0,0 for one without distortion"
+        refuse(f"--view-K is given, and the lens of LEFT distorts: {cure}.")
     if is_distorted(pair[0]):
-        cure = "Rectify the images, or give maps of undistorted.png, which a first run writes."
         names = ("points_confidence", "disparity", "prior_map")
-        options.refuse(names, "of an image without lens distortion", "a lens with distortion", cure)
+        cure = "rectify the images, or give a map of undistorted.png, which a first run writes"
+        options.refuse(names, f"{{}} cannot be used with a lens that distorts: {cure}.")
     lenses = [*pair, *further] if further else [*pair, *(pair[0] for _ in options.view)]
     return tuple(lens if is_distorted(lens) else None for lens in lenses)

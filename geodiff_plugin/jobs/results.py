@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin import formats, plotting
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, refuse
 from geodiff_plugin.formats.depth import disparity_of_depth
 from geodiff_plugin.formats.files import read_npy
 from geodiff_plugin.formats.out import REPORT, check_new_file, write_text
@@ -61,8 +61,8 @@ def write_video(
     sizes = ["{1}x{0}".format(*depth_m.shape) for depth_m in depths_m]
     for path, size in zip(frames, sizes, strict=True):
         if size != sizes[0]:
-            expected = f"all of one shape, {sizes[0]} pixels as {frames[0]}"
-            bad_value("FRAME", expected, f"{path} of {size}", "Make a video of each size.")
+            both = f"{sizes[0]} in {frames[0]}, {size} in {path}"
+            refuse(f"The frames have different sizes: {both}. Make a video of each size.")
     metric = all(read_report(file.parent).get("unit", "m") is not None for file in files)
     pictures = plotting.depth_frames(depths_m, near=near, far=far, unit="m" if metric else None)
     plotting.write_depth_video(out, pictures, fps)
@@ -90,13 +90,12 @@ def write_submission(results: Sequence[Path], to: str, out: Path, method: str = 
         bad_value("--method", "letters and digits", repr(method))
     folders = [path.parent for folder in results for path in sorted(folder.glob(f"**/{REPORT}"))]
     if not folders:
-        bad_value("RESULT", "a folder of geodiff depth", ", ".join(map(str, results)))
+        refuse(f"No result of geodiff depth lies in {', '.join(map(str, results))}.")
     scenes: set[Path] = set()
     for folder in folders:
         result = _submitted(folder)
         if result.scene in scenes:
-            expected = "one pair of every scene, whose folder its left image lies in"
-            bad_value("RESULT", expected, f"two of {result.scene}")
+            refuse(f"Two results are of the scene {result.scene}: give one of each.")
         scenes.add(result.scene)
         if to == "middlebury":
             _write_middlebury(result, out, method)
@@ -110,7 +109,7 @@ def write_submission(results: Sequence[Path], to: str, out: Path, method: str = 
 def _submitted(folder: Path) -> _Submitted:
     report = read_report(folder)
     if "inputs" not in report:
-        bad_value("RESULT", "made by geodiff depth", folder)
+        refuse(f"{folder / REPORT} is no report of geodiff depth.")
     K_left, K_right, E = (np.array(report["inputs"][n], np.float64) for n in ("K_left", "K_right", "E"))
     depth_m = read_npy(folder / "depth.npy", "RESULT", "a depth map")
     scene = Path(report["arguments"]["left"]).absolute().parent

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from geodiff_plugin._checks import bad_type, bad_value, check_choice
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline
 from geodiff_plugin.priors.geowizard import GeoWizardPipeline
-from geodiff_plugin.priors.loading import BUNDLED_FOLDER, Layout, fetch, reading, refuse
+from geodiff_plugin.priors.loading import BUNDLED_FOLDER, Layout, fetch, no_bars, reading, refuse
 from geodiff_plugin.priors.lotus import LotusPipeline
 from geodiff_plugin.priors.map import MAP_LAYOUT, DepthMapPipeline
 from geodiff_plugin.priors.marigold import E2EFTPrior, MarigoldPrior
@@ -78,7 +79,8 @@ class PriorSource:
             expected = "one that PyTorch has on this machine"
             with reading("device", expected, repr(str(device)), "Try 'cpu'."):
                 torch.empty(1, device=device)
-        pipe = PRIORS[self.key].load(self.layout, dtype, space)
+        with no_bars() if self.layout.folder == BUNDLED_FOLDER else nullcontext():  # it is small
+            pipe = PRIORS[self.key].load(self.layout, dtype, space)
         pipe.register_to_config(_name_or_path=self.layout.name)
         return pipe.to(device) if device is not None else pipe
 

@@ -23,7 +23,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from transformers import Dinov2Config, Dinov2Model
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, refuse
 from geodiff_plugin.priors.components import FixedPrompt
 from geodiff_plugin.priors.depthfm import DepthFMPipeline
 from geodiff_plugin.priors.loading import Layout, check_weights, load_component, reading
@@ -87,10 +87,10 @@ def convert_prior(paths: Sequence[Path], part: str | None = None, space: str | N
     """
     layered = len(paths) == 4 and str(paths[0]) == MARIGOLD_V2
     if not layered and len(paths) != 2:
-        expected = f"SRC DST, or {MARIGOLD_V2} BASE CHECKPOINT DST"
-        bad_value("paths", expected, " ".join(map(str, paths)) or "none")
+        got = " ".join(map(str, paths)) or "none"
+        refuse(f"Give two paths, SRC DST, or {MARIGOLD_V2} BASE CHECKPOINT DST; got {got}.")
     if not layered and space:
-        bad_value("--space", f"for {MARIGOLD_V2} alone", f"given for {paths[0]}")
+        refuse(f"--space is for {MARIGOLD_V2} alone: leave it out for {paths[0]}.")
     source, target = paths[-2:]
     if os.path.lexists(target):
         bad_value("DST", "a folder that does not exist yet", target, "Name another, or remove it first.")
@@ -172,8 +172,7 @@ def _safe_name(name: str) -> str:
 def _convert_folder(source: Path, folder: Path) -> None:
     """Write the same folder, of one component or several, with safetensors in place of ``.bin`` files."""
     if not any(source.rglob("*.bin")):
-        expected, cure = "a checkpoint file, or a folder with .bin weights", "Give it to --prior as it is."
-        bad_value("SRC", expected, f"the folder {source} without: it needs no conversion", cure)
+        refuse(f"The folder {source} has no .bin weights to convert: give it to --prior as it is.")
     for path in sorted(p for p in source.rglob("*") if p.is_file()):
         target = folder / path.relative_to(source)
         safe = target.with_name(_safe_name(path.name))

@@ -17,12 +17,17 @@ from typing import Any
 import diffusers
 import torch
 import transformers
+from diffusers.utils import logging as diffusers_logging
 from huggingface_hub import metadata_load, snapshot_download
+from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_bars
+from transformers.utils import logging as transformers_logging
 from yaml import YAMLError
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.priors import components
 
+#: Hosts with a switch for their progress bars.
+HOSTS = (diffusers_logging, transformers_logging)
 BUNDLED_FOLDER = Path(__file__).resolve().parents[1] / "bundled" / "prior"
 
 #: Priors that people ask for and that cannot be run: pattern of the last part of the name -> reason.
@@ -55,6 +60,22 @@ def reading(what: str, expected: str, got: str, cure: str) -> Iterator[None]:
     else:
         return
     bad_value(what, expected, f"{got} ({reason})", cure)
+
+
+@contextmanager
+def no_bars() -> Iterator[None]:
+    """Switch off the progress bars of diffusers and transformers inside, and leave them as they were."""
+    shown = [host for host in HOSTS if host.is_progress_bar_enabled()]
+    hub_is_quiet = are_progress_bars_disabled()
+    for host in shown:
+        host.disable_progress_bar()
+    try:
+        yield
+    finally:
+        for host in shown:
+            host.enable_progress_bar()
+        if hub_is_quiet and shown:  # transformers' switch is the hub's as well
+            disable_progress_bars()
 
 
 @dataclass(frozen=True)

@@ -172,7 +172,7 @@ def test_geowizard_with_its_option(geodiff, tmp_path, command):
         (["--option", "domain=outdoor"], "--option must be one that marigold takes (none); got 'domain'"),
         (["--prior", "developy/ApDepth"], "It is refused because"),
         (["--prior", "no/such-prior"], "bundled"),
-        (["--prior-map", "none.npy"], "in place of a --prior"),
+        (["--prior-map", "none.npy"], "takes the place of a prior"),
     ],
 )
 def test_priors_that_cannot_be(geodiff, command, options, said, monkeypatch):

@@ -256,4 +256,4 @@ def test_the_video_of_a_rig(geodiff, fresh, textured_plane, videos):
     answer = geodiff("depth", *videos, *words, "--overwrite")  # nothing of --steady is left
     assert answer.code == 0 and not list(Path("out").glob("*/*_alone.npy")), answer.err
     answer = geodiff("depth", *videos, *words, "--export", "colmap", "--overwrite")
-    assert answer.code == 2 and "--export colmap must be left out with a video" in answer.err
+    assert answer.code == 2 and "--export colmap does not take a video" in answer.err

@@ -8,12 +8,17 @@ import numpy as np
 import pytest
 import torch
 from diffusers import MarigoldDepthPipeline
+from diffusers.utils import logging as diffusers_logging
+from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
+from transformers.utils import logging as transformers_logging
 
 from examples.training import data
 from examples.training.models import save_prior
 from examples.training.train import parse, run
 from geodiff_plugin.bundled import load_bundled_prior
-from geodiff_plugin.priors import BUNDLED_FOLDER
+from geodiff_plugin.jobs.prior import load_guided_prior
+from geodiff_plugin.jobs.telling import silent
+from geodiff_plugin.priors import BUNDLED_FOLDER, load_prior
 from tests.conftest import guided_call, quiet
 
 
@@ -42,6 +47,26 @@ def test_the_loader_gives_a_new_quiet_pipeline_each_time_without_a_network(capfd
     assert type(first) is MarigoldDepthPipeline and first is not second
     assert first.unet.dtype == torch.float32 and second.unet.dtype == torch.bfloat16
     assert first.device.type == "cpu" and capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("hub_is_quiet", [False, True])
+def test_no_bar_shows_where_the_bundled_prior_loads_and_bars_are_left_as_they_were(capfd, hub_is_quiet):
+    hosts, quiet_before = (diffusers_logging, transformers_logging), are_progress_bars_disabled()
+    enabled_before = [host.is_progress_bar_enabled() for host in hosts]
+    try:
+        for host in hosts:
+            host.enable_progress_bar()
+        if hub_is_quiet:
+            disable_progress_bars()
+        load_prior("bundled")
+        load_guided_prior("bundled", torch.device("cpu"), tell=silent)
+        assert "Loading" not in capfd.readouterr().err
+        assert all(host.is_progress_bar_enabled() for host in hosts)
+        assert are_progress_bars_disabled() is hub_is_quiet
+    finally:
+        for host, enabled in zip(hosts, enabled_before, strict=True):
+            (host.enable_progress_bar if enabled else host.disable_progress_bar)()
+        (disable_progress_bars if quiet_before else enable_progress_bars)()
 
 
 @pytest.mark.slow

@@ -85,15 +85,15 @@ def test_fields_become_options_and_those_of_another_way_are_left_out(photographs
 
 def test_what_a_visitor_left_out_or_gave_wrongly(photographs, monkeypatch):
     for left, way, said in (
-        (photographs[0], "numbers", "fx and baseline must be given"),
-        (photographs[0], "photographs", "the distance of the cameras, or a known length, must be given"),
-        (photographs[0], "file", "calibration must be a calibration file"),
-        (None, "file", "the left photograph must be given"),
+        (photographs[0], "numbers", "Give fx and baseline as well"),
+        (photographs[0], "photographs", "Photographs have no unit: measure the distance between the cameras"),
+        (photographs[0], "file", "The calibration file is missing"),
+        (None, "file", "the left photograph is missing"),
         (__file__, "file", "the left photograph must be an image file"),
     ):
         with pytest.raises(ValueError, match=said):
             options_of(left, photographs[1], way)
-    with pytest.raises(ValueError, match="ends of the known length must be two pixels; got '3, 4'. Tap both"):
+    with pytest.raises(ValueError, match="ends of the known length are two pixels: tap both"):
         options_of(*photographs, "photographs", known_length=0.8, ends="3, 4")
     monkeypatch.setattr(job, "MOST_MEGAPIXELS", 0.003)
     with pytest.raises(ValueError, match="at most 0.003 megapixels; got 64x48"):
@@ -108,7 +108,7 @@ def test_a_calibration_without_a_unit_needs_the_distance(photographs, priors, tm
     ]
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps({"fl_x": 60.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "frames": frames}))
-    with pytest.raises(ValueError, match="the distance of the cameras must be given.*has no unit"):
+    with pytest.raises(ValueError, match="has no unit: give the distance between the two cameras"):
         run(options_of(*photographs, "file", (str(path),), prior="tiny"), priors)
 
 

@@ -15,7 +15,6 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from geodiff_plugin.bundled import no_bars
 from geodiff_plugin.config import FAST, PAPER, PRIOR_FIT, GuidanceConfig, config_from_text
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evidence.guidance import GeometryGuidance
@@ -23,6 +22,7 @@ from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.jobs.runner import fingerprint
 from geodiff_plugin.priors import load_prior, prior_of
 from geodiff_plugin.priors.components import DirectScheduler
+from geodiff_plugin.priors.loading import no_bars
 from geodiff_plugin.priors.map import DepthMapPipeline
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from geodiff_plugin.scale.space import SPACES
