@@ -67,6 +67,7 @@ def run_info(prior: str | None, space: str | None, knobs: bool) -> None:
     except CacheNotFound:
         models = []
     cached = sorted(f"{repo.repo_id} ({repo.size_on_disk / 1e6:.1f} MB)" for repo in models)
-    rows += [("adapters", line) for line in wrap(", ".join(PRIORS), LINE_WIDTH)]
+    first, *others = wrap(", ".join(PRIORS), LINE_WIDTH)
+    rows += [("adapters", first), *(("", line) for line in others)]
     rows += [("cached", line) for line in cached or ["nothing"]]
     print_lines([*rows, ("package", str(Path(__file__).resolve().parents[1])), *described])

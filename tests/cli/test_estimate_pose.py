@@ -119,7 +119,7 @@ def test_every_photograph_has_its_lens():
         assert told(**given) == expected, given
     for error, given in (
         ("lens of each by --view-distortion", {"view": view, "view_k": view}),
-        ("--prior-map must be of an image without lens distortion", {"prior_map": Path("map.npy")}),
+        ("--prior-map cannot be used with a lens that distorts", {"prior_map": Path("map.npy")}),
     ):
         with pytest.raises(InputError, match=error):
             told(own=own, **given)
