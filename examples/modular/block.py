@@ -40,7 +40,7 @@ from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.priors import prior_of
 from geodiff_plugin.runtime.estimate import ProcessingGrid
 from geodiff_plugin.runtime.hooks import frozen_weights
-from geodiff_plugin.runtime.pipeline import guided_steps
+from geodiff_plugin.runtime.pipeline import count_guided_steps
 from geodiff_plugin.runtime.run import GuidedRun, RunInputs
 
 UNET = ComponentSpec("unet", UNet2DConditionModel)
@@ -333,7 +333,7 @@ class GeometryEvidenceStep(Block):
         knobs = {**(block_state.knobs or {}), "points": block_state.points}
         guidance = GeometryGuidance(block_state.right, block_state.K, block_state.E, **knobs)
         asked = block_state.num_inference_steps
-        steps, rounds = guided_steps(host, guidance, asked)
+        steps, rounds = count_guided_steps(host, guidance, asked)
         evidence = guidance.prepare(left_images(block_state.image).to(host.vae.device))
         signature = inspect.signature(host.__call__)
         call = {name: value.default for name, value in signature.parameters.items()}

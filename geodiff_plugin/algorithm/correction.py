@@ -18,41 +18,61 @@ from geodiff_plugin.scale.points import weighted_quantile
 #: Longer side in pixels of the grid for which ``smoothness``, ``IMAGE_EDGE`` and ``DEPTH_EDGE`` hold; on
 #: other grids they are scaled, so that a correction reaches the same share of the image.
 REFERENCE_SIDE = 512.0
-#: Error of the prior at which ``smoothness`` and ``INERTIA`` hold; both fall with this power of the error.
-REFERENCE_ERROR, STIFFNESS_POWER = 0.05, 4.0
-#: Bounds of the smoothness.
-LOOSEST, STIFFEST = 0.03, 100.0
+#: Error of the prior at which ``smoothness`` and ``INERTIA`` hold.
+REFERENCE_ERROR = 0.05
+#: Both fall with this power of the error: a weak prior's map hardly resists its matches.
+STIFFNESS_POWER = 4.0
+#: Lower bound of the smoothness: the map of a useless prior still carries a match to its neighbours.
+LOOSEST = 0.03
+#: Upper bound of the smoothness: the map of an exact prior still gives way over wide regions.
+STIFFEST = 100.0
 #: Weight of the squared correction, so that pixels far from every match keep their depth.
 INERTIA = 0.015
-#: Bounds of the inertia in the last pass.
-LEAST_INERTIA, MOST_INERTIA = 5e-4, 0.03
+#: Lower bound of the inertia in the last pass: without any the correction far from matches is undetermined.
+LEAST_INERTIA = 5e-4
+#: Upper bound of the inertia: more would hold back the correction at the matches themselves.
+MOST_INERTIA = 0.03
 #: Passes of a fit; the smoothness falls geometrically from a broad one to that of the prior's error.
 PASSES = 3
-#: Smoothness and least inertia of the first pass: it corrects whole regions, even far from any match.
-BROAD_SMOOTHNESS, BROAD_INERTIA = 50.0, 1e-4
-#: Smoothness, and inertia as a share of it, of the fit that measures the prior and finds outliers.
-STIFF_SMOOTHNESS, STIFF_INERTIA = 400.0, 1.3e-3
-#: Robustly reweighted solves, and conjugate-gradient steps of each on every level of its pyramid.
-REWEIGHTINGS, SOLVER_STEPS = 2, 6
+#: Least smoothness of the first pass: it corrects whole regions.
+BROAD_SMOOTHNESS = 50.0
+#: Least inertia of the first pass: low, so that it corrects even far from any match.
+BROAD_INERTIA = 1e-4
+#: Smoothness of the fit that measures the prior and finds outliers: it bends the map over wide regions only.
+STIFF_SMOOTHNESS = 400.0
+#: Inertia of that fit, as a share of its smoothness.
+STIFF_INERTIA = 1.3e-3
+#: Robustly reweighted solves of a pass: a fixed number, so that no GPU is waited for.
+REWEIGHTINGS = 2
+#: Conjugate-gradient steps of a solve on every level of its pyramid, which truncate it: see ``fit_depth``.
+SOLVER_STEPS = 6
 #: Residual, in standard deviations of a match, from which it counts for less.
 RESIDUAL_CAUCHY = 2.5
 #: Side of the blocks of matches left out to measure the prior, in image sides.
 BLOCK = 0.08
-#: Bounds of the error that is assumed of a prior, in log depth.
-LEAST_ERROR, MOST_ERROR = 0.01, 0.5
+#: Least error that is assumed of a prior, in log depth: matches cannot measure a smaller one.
+LEAST_ERROR = 0.01
+#: The largest error: that of a useless prior.
+MOST_ERROR = 0.5
 #: Of fewer points the measured error is partly chance: the fewer, the nearer to the largest it is taken.
 FEW_POINTS = 100
-#: Steps in brightness and in log depth across which a correction does not spread.
-IMAGE_EDGE, DEPTH_EDGE = 0.1, 0.1
+#: Step in brightness across which a correction does not spread.
+IMAGE_EDGE = 0.1
+#: Step in log depth across which it does not.
+DEPTH_EDGE = 0.1
 #: Share of the smoothness that remains across any edge.
 LEAST_LINK = 1e-3
-#: Reach of a match over an edge, as a share of the longer side; step in log depth that is an edge.
-EDGE_REACH, EDGE_STEP = 0.006, 0.3
+#: Reach of a match over an edge, as a share of the longer side.
+EDGE_REACH = 0.006
+#: Step in log depth that is an edge.
+EDGE_STEP = 0.3
 #: Above this error of the prior, ``EDGE_STEP`` grows with its third power: its edges are in wrong places.
 EDGE_ERROR = 0.11
-#: The prior's error is this quantile of the correct matches' residuals over the normal distribution's: the
-#: median would miss that a fifth of the scene is on a wrong surface.
-SHARE, NORMAL_QUANTILE = 0.8, 1.2816
+#: The prior's error is measured at this quantile of the correct matches' residuals: the median would miss
+#: that a fifth of the scene is on a wrong surface.
+SHARE = 0.8
+#: The same quantile of the size of a normal variable, by which it is divided.
+NORMAL_QUANTILE = 1.2816
 
 
 class _Observations(NamedTuple):

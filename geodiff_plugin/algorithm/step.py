@@ -6,7 +6,7 @@ Source: Algorithm 1, with Eq. 16 and 17, which it omits; z0_hat is decoded, wher
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -40,14 +40,35 @@ class Estimate(Protocol):
         """The clean latent of a relative map."""
 
 
-def gradient_step(
-    state: Trajectory, estimate: Estimate, z: Tensor, anchor: Tensor, is_first: bool
-) -> tuple[Tensor, Tensor, Loss]:
+class Update(NamedTuple):
+    """One gradient update: the moved latent, and the map and the loss before the move."""
+
+    latent: Tensor
+    relative: Tensor
+    loss: Loss
+
+
+class Correction(NamedTuple):
+    """One correction: the clean latent, and the map that the next round or the result starts from."""
+
+    latent: Tensor
+    relative: Tensor
+
+
+class GuidedStep(NamedTuple):
+    """What guidance did at one denoising step."""
+
+    move: Tensor  # (B, C, h, w) the change of the latent
+    relative: Tensor  # (B, 1, h', w') the latest map
+    is_current: bool  # whether the result starts from this map without another decode
+
+
+def gradient_step(state: Trajectory, estimate: Estimate, z: Tensor, anchor: Tensor, is_first: bool) -> Update:
     """One pass of Algorithm 1's loop body, without the score before it and the DDIM line after it.
 
     It moves ``z (B, C, h, w)``, z_t or z0_hat, and updates scale s_hat, shift t_hat and the optimisers in
     ``state``. The first update of a round (``is_first``) also searches g_s (S7.3). ``anchor`` is the clean
-    latent that the anchor term pulls towards. Returns the moved z; the relative map and loss before the move.
+    latent that the anchor term pulls towards.
     """
     moves = state.config.optimize_latents
     with torch.enable_grad():
@@ -74,19 +95,23 @@ def gradient_step(
         state.note("the gradient in the latent", grad_z)
         z = z.detach() + state.latent_rule.step(grad_z, estimate.eps)
     state.affine = replace(affine, s_hat=s_hat, t_hat=t_hat)
-    return z, x0.detach(), L_geo
+    return Update(z, x0.detach(), L_geo)
 
 
 @torch.no_grad()
-def corrected_step(
-    state: Trajectory, estimate: Estimate, z0: Tensor, is_result: bool
-) -> tuple[Tensor, Tensor]:
-    """Fit the decoded map to matches and points and encode the change; returns clean latent and relative map.
+def corrected_step(state: Trajectory, estimate: Estimate, z0: Tensor, is_result: bool) -> Correction:
+    """Fit the decoded map to matches and points, and encode the change.
 
-    The latent ``z0 (B, C, h, w)`` moves by the difference between the encodings of the two maps: so the
-    autoencoder's loss does not add up, and a map that needs no correction leaves the latent unchanged. If no
-    round follows (``is_result``) and the output will be refined (``crisp``), the uncorrected map is returned:
-    fitted to the matches twice it would follow their noise. The map is encoded only if the latent is read.
+    With ``x = D(z0)`` of depth ``d(x)``, the corrected map ``x*`` has ``log d(x*) = log d(x) - u``. A few
+    steps of a solver bring ``u`` towards the minimum of ``sum w (u - r)^2 + a sum g |grad u|^2 + b sum u^2``:
+    ``r`` is the log of a match's inverse depth over the map's, ``w`` its weight, and ``g`` falls at edges
+    (``correction.fit_depth``). The latent ``(B, C, h, w)`` becomes ``z0 + E(x*) - E(x)``: by the difference
+    of two encodings the autoencoder's loss does not add up, and a map that needs no correction leaves the
+    latent unchanged.
+
+    If no round follows (``is_result``) and the output will be refined (``crisp``), the uncorrected map is
+    returned: fitted to the matches twice it would follow their noise. The map is encoded only if the latent
+    is read.
 
     Source: Gregorek and Nalpantidis 2024, "SteeredMarigold".
     """
@@ -95,23 +120,19 @@ def corrected_step(
     unused = is_result and not estimate.latent_is_read
     refined_later = is_result and state.config.crisp
     if unused and refined_later:
-        return z0, x
+        return Correction(z0, x)
     corrected = state.corrected(x)
     state.note("the corrected map", corrected)
     if corrected is not x and not unused:
         z0 = z0 + estimate.encode(corrected) - estimate.encode(x)
         state.note("the encoded correction", z0)
-    return z0, x if refined_later else corrected
+    return Correction(z0, x if refined_later else corrected)
 
 
 def guided_step(
     state: Trajectory, estimate: Estimate, rounds: tuple[Round, ...], is_last: bool
-) -> tuple[Tensor, Tensor, bool]:
-    """Run the rounds of one denoising step.
-
-    Returns the change of the latent, the latest relative map, and whether the result
-    starts from this map without another decode.
-    """
+) -> GuidedStep:
+    """Run the rounds of one denoising step, whose corrected map is the result if it ``is_last``."""
     z, anchor, x, is_current = estimate.latent, None, None, False
     for k, (corrects, updates) in enumerate(rounds):
         is_current, before = corrects and not updates, None
@@ -130,4 +151,4 @@ def guided_step(
             before = before or loss
         state.report(before)
     assert x is not None  # there is one round at least
-    return (z - estimate.latent).detach(), x, is_current
+    return GuidedStep((z - estimate.latent).detach(), x, is_current)

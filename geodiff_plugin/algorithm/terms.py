@@ -23,20 +23,26 @@ from geodiff_plugin.types import PosedViews
 
 #: Pyramid levels with a shorter side than this are left out.
 MIN_SIDE = 24
-#: SSIM's two constants for images in [0, 1].
-C1, C2 = 0.01**2, 0.03**2
-#: The 3 taps of its Gaussian window of 1.5 pixels, before they sum to 1.
+#: SSIM's constant of the means, for images in [0, 1], as its authors set it.
+C1 = 0.01**2
+#: SSIM's constant of the variances, likewise.
+C2 = 0.03**2
+# The outer taps of its Gaussian window of 1.5 pixels, before the 3 of them sum to 1.
 _TAP = math.exp(-0.5 / 1.5**2)
-TAP_BESIDE, TAP_CENTRE = _TAP / (1.0 + 2.0 * _TAP), 1.0 / (1.0 + 2.0 * _TAP)
+#: The outer taps.
+TAP_BESIDE = _TAP / (1.0 + 2.0 * _TAP)
+#: The middle tap.
+TAP_CENTRE = 1.0 / (1.0 + 2.0 * _TAP)
 #: Photometric error of a view that does not see the pixel: above any other.
 UNSEEN = 2.0
 #: Added to a spread, so that a blank image causes no division by zero.
 BLANK_SPREAD = 1e-3
 #: Bounds of the exposure gain; beyond them two photographs do not show the same scene.
 GAINS = (0.2, 5.0)
-#: Rows and columns of the smooth shading field (vignetting, sun from one side); share of a cell in view at
-#: which the cell's mean counts half.
-CELLS, CELL_PRIOR = (4, 5), 0.2
+#: Rows and columns of the smooth shading field (vignetting, sun from one side).
+CELLS = (4, 5)
+#: Share of a cell in view at which the cell's mean counts half: the mean of a few pixels is no shading.
+CELL_PRIOR = 0.2
 #: Errors at points up to this share of the unit are float32's rounding and pull no more: a rule that gives
 #: every gradient the same length would follow their sign.
 ROUNDING = 1e-3

@@ -24,7 +24,7 @@ from geodiff_plugin.jobs.report import single_map, summary_line
 from geodiff_plugin.jobs.telling import collected_warnings, say, silent
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
 from geodiff_plugin.runtime.machine import pick_device, timed
-from geodiff_plugin.runtime.pipeline import guided_steps
+from geodiff_plugin.runtime.pipeline import count_guided_steps
 
 CELL_WIDTH = 360
 #: Calls of which the fastest counts.
@@ -65,7 +65,7 @@ def run_bench(prior: str, space: str | None, steps: int | None, seed: int, devic
     where = f"{place}, {torch.get_num_threads()} threads, torch {torch.__version__}"
     pipe, cameras = load_guided_prior(prior, place, space), (pair.rig.K_left, pair.rig.K_right)
     guidance = GeometryGuidance(pair.right, cameras, pair.rig.E)
-    count, _ = guided_steps(pipe, guidance, steps)
+    count, _ = count_guided_steps(pipe, guidance, steps)
     generator = torch.Generator("cpu").manual_seed(seed)
     table, fastest = new_table(("", "seconds", "time x")), list[float]()
     for name, given in (("plain", None), ("guided", guidance)):

@@ -282,7 +282,11 @@ def find_scale(
     known_length: tuple[float, float, float, float, float] | None,
     points: np.ndarray | None,
 ) -> Scale:
-    """Metres per unit, from whichever length is given; arguments as ``from_photographs``.
+    """Metres per unit ``s``, from whichever length is given; arguments as ``from_photographs``.
+
+    A measured baseline ``b`` gives ``s = b / |t|``, with ``t`` that of the first right camera; a known length
+    ``l`` between two points ``X`` of the scene ``s = l / |X_1 - X_2|``; known points of depth ``z_i`` metres
+    ``s = argmin_s sum_i |z_i / d_i - s|``, with ``d_i`` units the depth of the match nearest to each.
 
     ``Ts (V, 4, 4)`` are ``T_right_from_left`` in units; ``factor`` is pixels of the tracks' grid a pixel of
     the left photograph; ``points`` ``(N, 3)`` metres in the left frame.

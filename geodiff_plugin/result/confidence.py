@@ -23,12 +23,22 @@ RIGHT_WITHIN = 0.1
 #: (``python -m tests.benchmarks.confidence`` refits them): constant, certainty, strength of the prior,
 #: photometric agreement, and relative spread of the ensemble (by hand: 10 % quarter the odds).
 BY_EVIDENCE = (-0.228, 0.788, 2.42, 0.0864, -15.0)
-# Bounds beyond which the photometric error, the prior's, and the error left in a depth make no difference.
-_LEAST_DIFFERENCE, _MOST_DIFFERENCE = 0.01, 0.1
-_STRONG, _WEAK = 0.03, 0.15
-_LEAST_LEFT, _MOST_LEFT = 0.0005, 0.05
-# Errors in log depth: the least that matches can measure, and that of a useless prior.
-_BEST, _USELESS = 0.01, 0.5
+# Below this photometric error images agree as well as their noise lets them.
+_LEAST_DIFFERENCE = 0.01
+# Above this photometric error they do not agree at all.
+_MOST_DIFFERENCE = 0.1
+# A smaller error of the prior, in log depth, makes no difference.
+_STRONG = 0.03
+# Nor does a larger one.
+_WEAK = 0.15
+# A smaller error that is left in a depth makes no difference.
+_LEAST_LEFT = 0.0005
+# Nor does a larger one.
+_MOST_LEFT = 0.05
+# The least error of a prior, in log depth, that matches can measure.
+_BEST = 0.01
+# The error of a useless prior.
+_USELESS = 0.5
 # Support at which the prior's error is half known: it is measured where there are matches, and a prior that
 # is right on the street may be wrong on the trees above it.
 _HALF_KNOWN = 0.1

@@ -54,7 +54,7 @@ class ImageResult:
     depth_m: Tensor  # metres
     K: Tensor  # (3, 3) pixels of ``depth_m``
     relative: Tensor  # the prior's map, about [0, 1]
-    scale: Tensor  # (E,)
+    scale: Tensor  # (E,) of the members of its ensemble
     shift: Tensor  # (E,)
     global_scale: Tensor  # (E,) metres
     verdict: Verdict
@@ -94,29 +94,24 @@ def finish(
     """
     native = evidence.native
     depth_m = _within_range(depth_m.float().to(native.left_01.device), members)
-    size = image_size(depth_m)
-    left_01 = _resized(native.left_01[None], size)
-    K = resize_intrinsics(native.K_left[None], native.size, size)
+    left_01 = _resized(native.left_01[None], image_size(depth_m))
+    K = resize_intrinsics(native.K_left[None], native.size, image_size(depth_m))
     refined = refine(evidence, members, depth_m, left_01, options.config) if options.config.crisp else None
-    support = None
     if refined is not None:
-        depth_m, support = refined
+        depth_m = refined.depth_m
     if uncertainty is not None:
         uncertainty = uncertainty.to(depth_m)
-        if support is not None:
+        if refined is not None:
             uncertainty = _spread_of_members(evidence, members, depth_m, left_01, options)
-    visible, error = None, None
-    if native.views:
-        visible, error = reprojection(native.views, depth_m, left_01, K)
+    visible, error = reprojection(native.views, depth_m, left_01, K) if native.views else (None, None)
     prior_error, confidence = _error_of(members), None
-    if support is not None:
-        nothing = torch.zeros_like(depth_m) if error is None else error
-        seen = (nothing, nothing > 0) if visible is None else (nothing, visible)
+    if refined is not None:
+        unseen = torch.zeros_like(depth_m) if error is None else error
+        seen = (unseen, unseen > 0) if visible is None else (unseen, visible)
         spread = None if uncertainty is None else uncertainty / depth_m
-        confidence = depth_confidence(support, *seen, spread, prior_error)
-    over_prior = _over_prior(members, depth_m)
+        confidence = depth_confidence(refined.support, *seen, spread, prior_error)
     relative = median(torch.cat([member.relative for member in members]), 0)[None]
-    measured = _Measured(depth_m, relative, confidence, over_prior, visible)
+    measured = _Measured(depth_m, relative, confidence, _over_prior(members, depth_m), visible)
     numbers = read_numbers(_numbers(evidence, members, measured, options))
     verdict = judge(_indicators(evidence, numbers, options))
     if confidence is not None:
@@ -125,7 +120,7 @@ def finish(
         evidence=evidence,
         depth_m=depth_m,
         K=K[0],
-        relative=_resized(relative, size, antialias=False),
+        relative=_resized(relative, image_size(depth_m), antialias=False),
         scale=torch.cat([member.affine.scale for member in members]),
         shift=torch.cat([member.affine.shift for member in members]),
         global_scale=torch.cat([member.affine.g_s for member in members]),
@@ -135,9 +130,9 @@ def finish(
         visible=visible,
         photometric_error=error,
         confidence=confidence,
-        support=support,
+        support=None if refined is None else refined.support,
         prior_error=prior_error,
-        over_prior=over_prior,
+        over_prior=measured.over_prior,
     )
 
 

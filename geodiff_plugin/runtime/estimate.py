@@ -26,8 +26,10 @@ from geodiff_plugin.runtime.hooks import DenoiserTap, put_channels
 #: What the scheduler's step is given: network output, noisy latent, and what to add to its result.
 StepInputs = tuple[Tensor, Tensor, Tensor | None]
 
-#: Values of the knob ``decoder`` that are neither a folder nor a hub id.
-FULL, TINY = "full", "tiny"
+#: Value of the knob ``decoder`` for the pipeline's own autoencoder.
+FULL = "full"
+#: Value of the knob for the tiny autoencoder that is published for its latent.
+TINY = "tiny"
 #: Channels, pixels per cell and scaling factor of a latent -> hub id of the tiny autoencoder for it.
 KNOWN: dict[tuple[Any, ...], str] = {
     (4, 8, 0.18215): "madebyollin/taesd",

@@ -111,7 +111,7 @@ class GuidedCall(_Stock):
         prior = prior_of(self)
         _check_arguments(call, len(lefts_01))
         asked = call["num_inference_steps"]
-        steps, rounds = guided_steps(self, guidance, asked)
+        steps, rounds = count_guided_steps(self, guidance, asked)
         resampling = call["resample_method_output"] or "bilinear"
         call |= {"num_inference_steps": steps, "resample_method_output": resampling}
         _check_guidable(self, prior, guidance)
@@ -215,7 +215,7 @@ def _check_guided_call(guidance: Any, callback: Any) -> None:
         )
 
 
-def guided_steps(pipe: Any, guidance: GeometryGuidance, asked: int | None) -> tuple[int, int]:
+def count_guided_steps(pipe: Any, guidance: GeometryGuidance, asked: int | None) -> tuple[int, int]:
     """Denoising steps of a guided call, of which the user ``asked`` for so many, and rounds in each."""
     wanted = guidance.denoising_steps(asked, pipe.default_denoising_steps)
     return count_steps(wanted, asked, prior_of(pipe).max_steps)

@@ -195,12 +195,13 @@ class GuidedRun:
         self._results[-1] = None
         if rounds := schedule.steps[self._step]:
             with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
-                move, self._shown, is_current = guided_step(trajectory, estimate, rounds, is_last)
+                step = guided_step(trajectory, estimate, rounds, is_last)
+            self._shown = step.relative
             # The map of a tiny decoder is not the result.
-            if is_current and (self._codec.tiny is None or not latent_is_read):
-                self._results[-1] = self._shown
+            if step.is_current and (self._codec.tiny is None or not latent_is_read):
+                self._results[-1] = step.relative
             if schedule.moves_at(self._step):
-                inputs = estimate.step_inputs(move, self.config.step_from == "updated")
+                inputs = estimate.step_inputs(step.move, self.config.step_from == "updated")
         if self._tap is not None:
             self._tap.release()
         return inputs

@@ -15,7 +15,7 @@ from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.census import census, census_cost, grey_levels
 from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.sweep import sweep_planes
-from geodiff_plugin.scale.volume_search import _lookup, group_pixels
+from geodiff_plugin.scale.volume_search import group_pixels, look_up
 from geodiff_plugin.types import CameraView
 from tests.golden.parts import scene, volume
 
@@ -82,13 +82,13 @@ def test_a_candidate_costs_the_mean_of_what_is_in_view():
     at = torch.arange(0, made.size[0] * made.size[1], 3)
     cost, in_view = made.at_pixels(at)
     planes, x = made.inverse_depth.numpy(), _random(len(at), seed=1)
-    mean_x, *counts = group_pixels(torch.from_numpy(x).float(), cost, in_view)
+    groups = group_pixels(torch.from_numpy(x).float(), cost, in_view)
     each = -(-len(at) // 512)
     parts = np.split(np.argsort(x), range(each, len(at), each))
-    assert each > 1 and len(parts) == len(mean_x)
+    assert each > 1 and len(parts) == len(groups.mean)
     depth = 1.5 + 12 * _random(4, len(parts))
-    found, share = _lookup(*counts, made.inverse_depth, torch.from_numpy(depth).float())
-    np.testing.assert_allclose(mean_x, [x[part].mean() for part in parts], rtol=1e-5)
+    found, share = look_up(groups, made.inverse_depth, torch.from_numpy(depth).float())
+    np.testing.assert_allclose(groups.mean, [x[part].mean() for part in parts], rtol=1e-5)
     for row, mean, seen in zip(depth, found, share, strict=True):
         total, count = 0.0, 0.0
         for part, z in zip(parts, row, strict=True):
