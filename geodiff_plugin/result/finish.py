@@ -106,8 +106,7 @@ def finish(
     visible, error = reprojection(native.views, depth_m, left_01, K) if native.views else (None, None)
     prior_error, confidence = _error_of(members), None
     if refined is not None:
-        unseen = torch.zeros_like(depth_m) if error is None else error
-        seen = (unseen, unseen > 0) if visible is None else (unseen, visible)
+        seen = (error, visible) if error is not None and visible is not None else _unseen(depth_m)
         spread = None if uncertainty is None else uncertainty / depth_m
         confidence = depth_confidence(refined.support, *seen, spread, prior_error)
     relative = median(torch.cat([member.relative for member in members]), 0)[None]
@@ -134,6 +133,11 @@ def finish(
         prior_error=prior_error,
         over_prior=measured.over_prior,
     )
+
+
+def _unseen(depth_m: Tensor) -> tuple[Tensor, Tensor]:
+    """Photometric error and visibility of a map without a right view."""
+    return torch.zeros_like(depth_m), torch.zeros_like(depth_m, dtype=torch.bool)
 
 
 def _resized(x: Tensor, size: tuple[int, int], antialias: bool = True) -> Tensor:
