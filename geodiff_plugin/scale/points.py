@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.matches import UNIT
 from geodiff_plugin.scale.space import SPACES, MetricMap, Space
@@ -117,8 +118,14 @@ def refine_to_matches(
     lower = _ends(form, near_m / math.exp(NEAR_REACH), far_m / math.exp(FAR_REACH))
     upper = _ends(form, near_m * math.exp(NEAR_REACH), far_m * math.exp(FAR_REACH))
     bounds = torch.minimum(lower, upper), torch.maximum(lower, upper)
-    for _ in range(FIT_ITERATIONS):
-        ends = _refine_once(form, ends, values, matched, noise, bounds)
+    if use_kernel(values):
+        from geodiff_plugin.scale import kernels
+
+        limits = FIT_ITERATIONS, FIT_FLOOR, FIT_CAUCHY
+        ends = kernels.refined_ends(space, ends, values, matched, noise, bounds, limits)
+    else:
+        for _ in range(FIT_ITERATIONS):
+            ends = _refine_once(form, ends, values, matched, noise, bounds)
     at_zero, at_one = (form.forward(end, torch.ones_like(end)) for end in ends.unbind(1))
     return ordered(*form.ends(at_zero, at_one))
 

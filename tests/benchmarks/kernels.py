@@ -24,6 +24,7 @@ from triton.compiler import ASTSource
 from geodiff_plugin.algorithm import kernels as algorithm
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.matching import kernels as matching
+from geodiff_plugin.scale import kernels as scale
 
 #: Compute capabilities of an A100 and of an H100.
 ARCHITECTURES = (80, 90)
@@ -57,6 +58,10 @@ def launches() -> Iterator[Compiled]:
         name = "winner and evidence" if evidence else "winner"
         yield Compiled(name, matching.winner_kernel, winner, sizes, 4)
     yield from _of_the_solver()
+    refine = 9 * "*fp32 " + "i32 i32 fp32 fp32"
+    for block in (1024, 16384):
+        sizes = {"FORM": scale.FORMS["depth"], "BLOCK": block, "CHUNK": scale.CHUNK}
+        yield Compiled(f"refinement, {block} matches", scale.refine_kernel, refine, sizes, scale.warps(block))
 
 
 def _of_the_solver() -> Iterator[Compiled]:
