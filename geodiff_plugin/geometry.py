@@ -7,6 +7,7 @@ comment says why it is not used.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -82,9 +83,14 @@ def is_rectified(K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> 
     return (turned <= ANGLE_TOLERANCE) & sideways & (uneven <= ANGLE_TOLERANCE * K_left[..., 1, 1])
 
 
-#: Where a left pixel goes in the right view, as a line ``z * A + b`` in its depth z: ``A (B, 3, H * W)`` is
-#: the homogeneous right pixel of its point at infinity, ``b (B, 3, 1)`` that of the left camera's centre.
-PlaneRays = tuple[Tensor, Tensor]
+class PlaneRays(NamedTuple):
+    """Where a left pixel goes in the right view: the line ``z * infinity + centre`` in its depth z.
+
+    Both are homogeneous right pixels: of the pixel's point at infinity, and of the left camera's centre.
+    """
+
+    infinity: Tensor  # (B, 3, H * W)
+    centre: Tensor  # (B, 3, 1)
 
 
 def constant_like(like: Tensor, *values: float) -> Tensor:
@@ -148,16 +154,16 @@ def plane_rays(
 ) -> PlaneRays:
     """The part of the projection from a left grid ``(H, W)`` to the right image that does not need depth.
 
-    A pixel of depth z has the homogeneous right pixel ``z * A + b``, whose third component is depth there.
-    Rays are made on the device of the cameras.
+    The third component of a homogeneous right pixel is the depth there. Rays are made on the device of the
+    cameras.
 
     Source: Eq. 25 (eq:forward-warp_supp), with the products of matrices taken once.
     """
     x, y, _ = _rays(size, K_left).flatten(1, 2)[:, None].unbind(-1)  # (B, 1, H * W) each, at z = 1
     M = K_right @ T_right_from_left[:, :3, :3]
     # Not a matrix product, which TF32 rounds by a quarter pixel.
-    A = M[..., 2:] + M[..., 1:2] * y + M[..., :1] * x
-    return A, K_right @ T_right_from_left[:, :3, 3:]
+    infinity = M[..., 2:] + M[..., 1:2] * y + M[..., :1] * x
+    return PlaneRays(infinity, K_right @ T_right_from_left[:, :3, 3:])
 
 
 def rays_of(like: Tensor, K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> PlaneRays:
@@ -172,8 +178,7 @@ def project_rays(depth_m: Tensor, rays: PlaneRays) -> tuple[Tensor, Tensor]:
     ``depth_m (B, 1, H, W)`` metres lies on the grid of the rays; differentiable in it.
     """
     height, width = depth_m.shape[-2:]
-    A, b = rays
-    p = depth_m.flatten(2) * A + b  # (B, 3, H * W)
+    p = depth_m.flatten(2) * rays.infinity + rays.centre  # (B, 3, H * W)
     z = p[:, 2]
     in_front, z_safe = _in_front(z)
     uv = torch.where(in_front[:, None], p[:, :2] / z_safe[:, None], torch.full_like(p[:, :2], _BEHIND_PX))

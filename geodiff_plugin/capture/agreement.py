@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -30,9 +31,6 @@ STEADY = 3
 SURE = 0.8
 #: The motion of a camera is known if so many matches fit it, to within so many pixels of the shrunk pictures.
 LEAST_INLIERS, INLIER_PX = 20, 1.5
-Maps = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-#: Of a picture: what ``sift_features`` returns, K, and depth on its grid.
-Seen = tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +52,17 @@ class DepthFrame:
         return rays * self.depth[v, u][:, None] @ self.E[:3, :3].T + self.E[:3, 3]
 
 
-def seen_in(frame: DepthFrame, other: DepthFrame) -> Maps:
-    """Where another frame's camera sees the points of a frame, ``(H, W)`` each.
+class SeenIn(NamedTuple):
+    """Where another frame's camera sees the points of a frame, ``(H, W)`` each."""
 
-    Rows and columns of its nearest pixels (0 outside), depth in its camera, whether inside of the picture.
-    """
+    row: np.ndarray  # of its nearest pixel; 0 outside
+    column: np.ndarray
+    z: np.ndarray  # depth in its camera
+    inside: np.ndarray  # whether in its picture
+
+
+def seen_in(frame: DepthFrame, other: DepthFrame) -> SeenIn:
+    """Where the camera of ``other`` sees the points of ``frame``."""
     T = np.linalg.inv(other.E)
     points = (frame.world() @ T[:3, :3].T + T[:3, 3]) @ other.K.T
     z = points[:, 2].reshape(frame.depth.shape)
@@ -67,7 +71,7 @@ def seen_in(frame: DepthFrame, other: DepthFrame) -> Maps:
         inside = (z > 1e-6) & (u > -0.5) & (v > -0.5)
         inside &= (u < other.depth.shape[1] - 0.5) & (v < other.depth.shape[0] - 0.5)
     row, column = (np.rint(np.where(inside, at, 0)).astype(int) for at in (v, u))
-    return row, column, z, inside
+    return SeenIn(row, column, z, inside)
 
 
 def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False) -> DepthFrame:
@@ -84,29 +88,26 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False
     confirmed, asked = (np.zeros(frame.depth.shape, np.uint8) for _ in range(2))
     missing = 1.0 - frame.confidence
     for other in others:
-        depth, sure, seen, same = _depth_by(other, frame)
-        asked += seen
-        confirmed += same
-        more = np.where(same, LEAST_WEIGHT + sure, 0.0)
+        said = _said_by(other, frame)
+        asked += said.seen
+        confirmed += said.agrees
+        more = np.where(said.agrees, LEAST_WEIGHT + said.confidence, 0.0)
         total += more
-        above += more / np.where(same, depth, 1.0)
-        missing = missing * np.where(same, 1.0 - RISES * sure, 1.0)
+        above += more / np.where(said.agrees, said.depth, 1.0)
+        missing = missing * np.where(said.agrees, 1.0 - RISES * said.confidence, 1.0)
     inverse, confidence = above / total, 1.0 - missing
     alone = (confirmed == 0) & (frame.confidence < (SURE if moving else np.inf))
     seen_by = [rendered(other, frame, other.confidence) for other in others] if alone.any() else []
-    for maps in seen_by:  # a surface of another frame before ours speaks against ours
-        asked += alone & (maps[0] > 0) & (maps[0] < (1 - SAME_SHARE) * frame.depth)
+    for depth, _ in seen_by:  # a surface of another frame before ours speaks against ours
+        asked += alone & (depth > 0) & (depth < (1 - SAME_SHARE) * frame.depth)
     if len(seen_by) >= OUTVOTES:
-        votes, share, new, new_confidence = _vote(seen_by, alone)
-        lost = (votes >= OUTVOTES) & (share > weight[alone])
+        vote = _vote(seen_by, alone)
+        lost = (vote.votes >= OUTVOTES) & (vote.weight > weight[alone])
         at = np.flatnonzero(alone)[lost]
-        for values, by_others in ((inverse, new), (confidence, new_confidence), (confirmed, votes)):
-            values.flat[at] = by_others[lost]
-        replaced = np.zeros(inverse.shape, np.uint8)
-        replaced.flat[at] = 1
-        near = cv2.dilate(replaced, np.ones((3, 3), np.uint8)) > 0
-        for _ in range(ROUNDS):
-            inverse = np.where(near, cv2.medianBlur(inverse.astype(np.float32), SMOOTHED), inverse)
+        inverse.flat[at] = vote.inverse_depth[lost]
+        confidence.flat[at] = vote.confidence[lost]
+        confirmed.flat[at] = vote.votes[lost]
+        inverse = _smoothed_around(inverse, at)
     return replace(
         frame,
         depth=(1.0 / inverse).astype(np.float32),
@@ -116,11 +117,26 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False
     )
 
 
-def _depth_by(other: DepthFrame, frame: DepthFrame) -> Maps:
-    """What another frame says of the point that each pixel of a frame shows, ``(H, W)`` each.
+def _smoothed_around(inverse: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Inverse depth ``(H, W)`` with a median at and beside the pixels of flat indices ``at``."""
+    replaced = np.zeros(inverse.shape, np.uint8)
+    replaced.flat[at] = 1
+    near = cv2.dilate(replaced, np.ones((3, 3), np.uint8)) > 0
+    for _ in range(ROUNDS):
+        inverse = np.where(near, cv2.medianBlur(inverse.astype(np.float32), SMOOTHED), inverse)
+    return inverse
 
-    Its depth in the frame's view, its confidence, whether it sees the point, whether both depths agree.
-    """
+
+class _Said(NamedTuple):
+    """What another frame says of the point that each pixel of a frame shows, ``(H, W)`` each."""
+
+    depth: np.ndarray  # in the frame's view
+    confidence: np.ndarray
+    seen: np.ndarray  # whether it sees the point, or a surface before it
+    agrees: np.ndarray  # whether both depths agree
+
+
+def _said_by(other: DepthFrame, frame: DepthFrame) -> _Said:
     row, column, z, seen = seen_in(frame, other)
     there = other.depth[row, column].astype(np.float64)
     moved = np.linalg.inv(frame.E) @ other.E
@@ -130,7 +146,7 @@ def _depth_by(other: DepthFrame, frame: DepthFrame) -> Maps:
     # The nearest pixel lies up to half a pixel beside the point, so only depths are compared.
     same = seen & (np.abs(there / z - 1) < SAME_SHARE) & (np.abs(depth / frame.depth - 1) < SAME_SHARE)
     # A point behind what the other frame sees is hidden from it, which says nothing against ours.
-    return depth, other.confidence[row, column], seen & (there > (1 - SAME_SHARE) * z), same
+    return _Said(depth, other.confidence[row, column], seen & (there > (1 - SAME_SHARE) * z), same)
 
 
 def rendered(other: DepthFrame, frame: DepthFrame, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -153,24 +169,30 @@ def rendered(other: DepthFrame, frame: DepthFrame, values: np.ndarray) -> tuple[
     return maps
 
 
-def _vote(seen_by: Sequence[tuple[np.ndarray, np.ndarray]], mask: np.ndarray) -> Maps:
-    """The depth that most of the other frames agree on, at the ``n`` pixels of a mask.
+class _Vote(NamedTuple):
+    """The depth that most of the other frames agree on, ``(n,)`` each."""
 
-    ``(n,)`` each: how many agree, their weight, their mean inverse depth and joint confidence.
-    """
+    votes: np.ndarray  # number of frames that agree
+    weight: np.ndarray  # of all of them
+    inverse_depth: np.ndarray  # their mean
+    confidence: np.ndarray  # their joint one
+
+
+def _vote(seen_by: Sequence[tuple[np.ndarray, np.ndarray]], mask: np.ndarray) -> _Vote:
+    """What the other frames, ``rendered``, agree on at the ``n`` pixels of a mask."""
     depths, sures = (np.stack([maps[k][mask] for maps in seen_by]) for k in (0, 1))
     weights = np.where(depths > 0, LEAST_WEIGHT + sures, 0.0)
     inverse = 1.0 / np.where(depths > 0, depths, 1.0)
-    best = [np.zeros(depths.shape[1]) for _ in range(4)]
+    best = _Vote(*(np.zeros(depths.shape[1]) for _ in _Vote._fields))
     for candidate in range(len(depths)):
         same = np.abs(inverse / inverse[candidate] - 1) < SAME_SHARE
         same &= (depths > 0) & (depths[candidate] > 0)
         weight = (weights * same).sum(0)
         mean = (weights * same * inverse).sum(0) / np.maximum(weight, 1e-9)
         sure = 1.0 - np.where(same, 1.0 - RISES * sures, 1.0).prod(0)
-        better, by_these = weight > best[1], (same.sum(0), weight, mean, sure)
-        best = [np.where(better, new, old) for new, old in zip(by_these, best, strict=True)]
-    return best[0].astype(np.uint8), best[1], best[2], best[3]
+        better, by_these = weight > best.weight, _Vote(same.sum(0), weight, mean, sure)
+        best = _Vote(*(np.where(better, new, old) for new, old in zip(by_these, best, strict=True)))
+    return best._replace(votes=best.votes.astype(np.uint8))
 
 
 def scene_poses(frames: Iterable[tuple[DepthFrame, np.ndarray]]) -> list[list[np.ndarray]]:
@@ -179,12 +201,13 @@ def scene_poses(frames: Iterable[tuple[DepthFrame, np.ndarray]]) -> list[list[np
     Frames come in order with their pictures ``(H, W, 3)`` in [0, 1]; their ``E`` is ignored. Where no motion
     fits, another scene begins. A scene's world is the camera of its first frame.
     """
-    scenes, before = list[list[np.ndarray]](), None
+    scenes = list[list[np.ndarray]]()
+    before: _Picture | None = None
     for frame, picture in frames:
         image, factor = torch.from_numpy(picture).permute(2, 0, 1), LONG_SIDE / max(picture.shape)
         grey, K = grey_image(image, torch.from_numpy(frame.K), min(1.0, factor))
         depth = cv2.resize(frame.depth, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        seen = sift_features(grey), K, depth
+        seen = _Picture(sift_features(grey), K, depth)
         T = None if before is None else _motion(before, seen)
         if T is None:
             scenes.append([np.eye(4)])
@@ -194,20 +217,27 @@ def scene_poses(frames: Iterable[tuple[DepthFrame, np.ndarray]]) -> list[list[np
     return scenes
 
 
-def _motion(before: Seen, after: Seen) -> np.ndarray | None:
+class _Picture(NamedTuple):
+    """What the motion of a camera is found by."""
+
+    features: tuple[np.ndarray, np.ndarray]  # of ``sift_features``
+    K: np.ndarray  # (3, 3) pixels
+    depth: np.ndarray  # (H, W) on its grid
+
+
+def _motion(before: _Picture, after: _Picture) -> np.ndarray | None:
     """``T (4, 4)`` from the camera before to the one after; ``None`` where too few matches fit one."""
-    (features, K, depth), (following, K_after, _) = before, after
-    pairs = match_features(features, following)
+    pairs = match_features(before.features, after.features)
     if len(pairs) < LEAST_INLIERS:
         return None
-    px, seen = features[0][pairs[:, 0], :2], following[0][pairs[:, 1], :2]
-    column, row = np.rint(px).astype(int).clip(0, np.array(depth.shape[::-1]) - 1).T
-    points = np.c_[px, np.ones(len(px))] @ np.linalg.inv(K).T * depth[row, column, None]
-    fits, turn, shift, inliers = cv2.solvePnPRansac(points, seen, K_after, None, reprojectionError=INLIER_PX)
+    px, seen = before.features[0][pairs[:, 0], :2], after.features[0][pairs[:, 1], :2]
+    column, row = np.rint(px).astype(int).clip(0, np.array(before.depth.shape[::-1]) - 1).T
+    points = np.c_[px, np.ones(len(px))] @ np.linalg.inv(before.K).T * before.depth[row, column, None]
+    fits, turn, shift, inliers = cv2.solvePnPRansac(points, seen, after.K, None, reprojectionError=INLIER_PX)
     if not fits or len(inliers) < LEAST_INLIERS:
         return None
     at = inliers[:, 0]
-    turn, shift = cv2.solvePnPRefineLM(points[at], seen[at], K_after, None, turn, shift)
+    turn, shift = cv2.solvePnPRefineLM(points[at], seen[at], after.K, None, turn, shift)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
     return T

@@ -139,7 +139,7 @@ def out_of_view(sample: StereoSample) -> np.ndarray:
     """``(H, W)`` bool: pixels with truth that the true depth puts behind or beside the right image."""
     left = DepthFrame("left", sample.depth_m, sample.valid, sample.K_left, np.eye(4))
     right = DepthFrame("right", sample.right[..., 0], sample.right[..., 0], sample.K_right, sample.E_scored)
-    return sample.valid & ~seen_in(left, right)[3]
+    return sample.valid & ~seen_in(left, right).inside
 
 
 @lru_cache(maxsize=1)

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -94,8 +94,19 @@ def both_halves(image_01: np.ndarray, name: str = "video") -> tuple[np.ndarray, 
     return left, right
 
 
-#: Nanoseconds of a message: by its header, and when it was recorded.
-Stamp = tuple[int, int]
+class Stamp(NamedTuple):
+    """Time of a message, nanoseconds."""
+
+    header_ns: int  # by its header
+    recorded_ns: int
+
+
+class BagFrame(NamedTuple):
+    """Depth of one image of a bag."""
+
+    stamp: Stamp  # of the image
+    depth_m: np.ndarray  # (H, W) metres; 0, NaN or less where unknown
+    K: np.ndarray  # (3, 3) pixels
 
 
 def is_bag(path: Path) -> bool:
@@ -121,7 +132,7 @@ def _connections(reader: Any, path: Path, topic: str) -> list[Any]:
     return [connection for connection in images if connection.topic == topic]
 
 
-def _header_stamp(raw: bytes | memoryview, is_ros2: bool) -> int:
+def _header_ns(raw: bytes | memoryview, is_ros2: bool) -> int:
     """Nanoseconds in the header, which every message with an image begins with."""
     layout = "<4xII" if not is_ros2 or raw[1] & 1 else ">4xII"
     seconds, nanoseconds = struct.unpack_from(layout, raw)
@@ -136,7 +147,7 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
         with _open_bag(path) as reader:
             for topic in topics:
                 messages = reader.messages(_connections(reader, path, topic))
-                stamps.append(sorted((_header_stamp(raw, reader.is2), at) for _, at, raw in messages))
+                stamps.append(sorted(Stamp(_header_ns(raw, reader.is2), at) for _, at, raw in messages))
     except InputError:
         raise
     except Exception as error:  # of any kind that a damaged bag leads to
@@ -145,8 +156,9 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
     pairs, free = [], stamps[1]
     for left in stamps[0]:
         at = bisect.bisect(free, left)
-        near = min(free[max(0, at - 1) : at + 1], key=lambda s: abs(s[0] - left[0]), default=None)
-        if near is not None and abs(near[0] - left[0]) <= 1e9 * tolerance_s:
+        around = free[max(0, at - 1) : at + 1]
+        near = min(around, key=lambda right: abs(right.header_ns - left.header_ns), default=None)
+        if near is not None and abs(near.header_ns - left.header_ns) <= 1e9 * tolerance_s:
             pairs.append((left, near))
             free.remove(near)
     if not pairs:
@@ -175,11 +187,11 @@ class BagReader(AbstractContextManager["BagReader"]):
         return np.hstack(images)
 
     def _image(self, connections: list[Any], stamp: Stamp) -> np.ndarray:
-        header, recorded = stamp
-        for connection, _, raw in self._reader.messages(connections, recorded, recorded + 1):
-            if _header_stamp(raw, self._reader.is2) == header:
+        at = stamp.recorded_ns
+        for connection, _, raw in self._reader.messages(connections, at, at + 1):
+            if _header_ns(raw, self._reader.is2) == stamp.header_ns:
                 return _decoded(self._reader.deserialize(raw, connection.msgtype), self._path)
-        raise InputFileError(f"the image of {header} ns in {self._path} does not read.")
+        raise InputFileError(f"the image of {stamp.header_ns} ns in {self._path} does not read.")
 
 
 def _decoded(message: Any, path: Path) -> np.ndarray:
@@ -222,13 +234,11 @@ def stereo_calibration(path: Path, topics: tuple[str, str]) -> tuple[list[str], 
     return texts, frames[0]
 
 
-def write_depth_bag(
-    path: Path, frames: Iterable[tuple[Stamp, np.ndarray, np.ndarray]], frame_id: str, encoding: str
-) -> int:
+def write_depth_bag(path: Path, frames: Iterable[BagFrame], frame_id: str, encoding: str) -> int:
     """Write ``/depth/image`` and ``/depth/camera_info`` of all frames, whole or not at all; how many.
 
-    ``path`` ends in .mcap (ROS 2) or .bag (ROS 1). A frame is the stamp, ``(H, W)`` metres and ``(3, 3)`` K.
-    ``"16UC1"`` is millimetres, 0 where unknown, ``"32FC1"`` metres, NaN where unknown.
+    ``path`` ends in .mcap (ROS 2) or .bag (ROS 1). ``"16UC1"`` is millimetres, 0 where unknown, ``"32FC1"``
+    metres, NaN where unknown.
     """
     from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
@@ -245,9 +255,9 @@ def write_depth_bag(
         writer: Any = rosbag2.Writer(made, **plugin) if is_ros2 else rosbag1.Writer(made)
         with writer:
             topics = [writer.add_connection(name, kind, typestore=store) for name, kind in kinds.items()]
-            for (stamped, recorded), depth_m, K in frames:
+            for stamp, depth_m, K in frames:
                 count += 1
-                time = store.types["builtin_interfaces/msg/Time"](*divmod(stamped, 1_000_000_000))
+                time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp.header_ns, 1_000_000_000))
                 order = {} if is_ros2 else {"seq": 0}
                 header = store.types["std_msgs/msg/Header"](**order, stamp=time, frame_id=frame_id)
                 values = np.where(depth_m > 0, depth_m, np.nan).astype("<f4")
@@ -258,6 +268,6 @@ def write_depth_bag(
                 matrices = [m.astype(np.float64).ravel() for m in (np.zeros(5), K, np.eye(3), P)]
                 camera = camera_of(header, *size, "plumb_bob", *matrices, 0, 0, roi)
                 for topic, message in zip(topics, (image, camera), strict=True):
-                    writer.write(topic, recorded, serialize(message, message.__msgtype__))
+                    writer.write(topic, stamp.recorded_ns, serialize(message, message.__msgtype__))
         os.replace(made / "depth.mcap" if is_ros2 else made, path)
     return count

@@ -50,11 +50,11 @@ def depth_bag(options: DepthOptions, *, tell: Tell = silent, progress: bool = Fa
     refs = start_many(options, tell)
     rows = depth_pairs(options, refs, tell=tell, progress=progress)
 
-    def results() -> Iterator[tuple[recordings.Stamp, np.ndarray, np.ndarray]]:
+    def results() -> Iterator[recordings.BagFrame]:
         for ref, (stamp, _) in zip(refs, pairs, strict=True):
             if report := read_report(frames / ref.name):
                 depth_m = np.load(frames / ref.name / "depth.npy", allow_pickle=False)
-                yield stamp, depth_m, np.reshape(report["K"], (3, 3))
+                yield recordings.BagFrame(stamp, depth_m, np.reshape(report["K"], (3, 3)))
 
     count = recordings.write_depth_bag(out, results(), frame_id, options.encoding)
     return BagResult(out, frames, count, rows)

@@ -67,8 +67,7 @@ class CostVolume:
 
 def _plane_uv(rays: PlaneRays, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
     """Right pixels ``(D, 2, N)`` of every left pixel on every plane, and ``(D, N)`` if it is in front."""
-    A, b = rays
-    p = A + inverse_depth[:, None, None] * b  # z * A + b, divided by z
+    p = rays.infinity + inverse_depth[:, None, None] * rays.centre  # the line in z, divided by z
     in_front = p[:, 2] > NEAREST_M
     return p[:, :2] / torch.where(in_front, p[:, 2], torch.ones_like(p[:, 2]))[:, None], in_front
 
@@ -80,9 +79,9 @@ def median_shift(rays: PlaneRays, inverse_depth: Tensor, name: str = "E") -> Ten
     (N,)`` passes behind the right camera. ``InputError`` that names the pose where no pixel's point at
     infinity is in front of it.
     """
-    A, b = rays
-    some = A[..., :: max(1, A.shape[-1] // 1024)], b
-    at_infinity, ahead = _plane_uv(some, A.new_zeros(1))
+    step = max(1, rays.infinity.shape[-1] // 1024)
+    some = rays._replace(infinity=rays.infinity[..., ::step])
+    at_infinity, ahead = _plane_uv(some, rays.infinity.new_zeros(1))
     if not ahead.any():
         bad_value(name, "a pose under which the views overlap", "a right camera that looks the other way")
     uv, in_front = _plane_uv(some, inverse_depth)
@@ -98,7 +97,7 @@ def inverse_depth_at_shift(rays: PlaneRays, shift_px: float, name: str = "E") ->
     If one camera stands behind the other, pixels move to the epipole at most, so ``shift_px`` is bounded by
     half of that way. ``InputError`` also where both cameras stand at one place.
     """
-    exponents = rays[0].new_tensor([-8.0, 5.0])
+    exponents = rays.infinity.new_tensor([-8.0, 5.0])
     most = float(median_shift(rays, 10.0 ** exponents[1:], name))
     if most < _LEAST_SHIFT_PX:
         bad_value(name, "a pose with a baseline", "both cameras at one place")

@@ -9,7 +9,9 @@ import pytest
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.recordings import (
+    BagFrame,
     BagReader,
+    Stamp,
     is_bag,
     list_pairs,
     stereo_calibration,
@@ -143,7 +145,8 @@ def test_cameras_of_raw_images(tmp_path) -> None:
 def test_depth_comes_back(tmp_path, suffix, encoding, kind, unit) -> None:
     depth_m = np.linspace(0.5, 9.0, 35, dtype=np.float32).reshape(5, 7)
     depth_m[0, 0], depth_m[1, 1] = np.nan, 0.0
-    frames = [((1_500_000_000_000_000_001 + n, 5 + n), depth_m + n, K) for n in range(2)]
+    stamps = [Stamp(1_500_000_000_000_000_001 + n, 5 + n) for n in range(2)]
+    frames = [BagFrame(stamp, depth_m + n, K) for n, stamp in enumerate(stamps)]
     path = tmp_path / f"depth{suffix}"
     assert write_depth_bag(path, frames, "optical", encoding) == 2
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
