@@ -339,7 +339,7 @@ class GeometryEvidenceStep(Block):
         call = {name: value.default for name, value in signature.parameters.items()}
         call |= {"image": block_state.image, "num_inference_steps": steps}
         grid = ProcessingGrid(block_state.content, block_state.padding)
-        inputs = RunInputs(guidance, evidence, call, grid, rounds)
+        inputs = RunInputs(guidance, lambda: evidence, call, grid, rounds)
         block_state.geometry = GuidedRun(host, prior, inputs)
         block_state.guidance, block_state.call, block_state.num_inference_steps = guidance, call, steps
 

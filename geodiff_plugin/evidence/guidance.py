@@ -319,8 +319,8 @@ class GeometryGuidance:
         """Steps of a guided call: as requested, else the pipeline's default, at least ``min_steps``."""
         return requested if requested is not None else max(pipeline_default or 1, self.config.min_steps)
 
-    def prepare(self, lefts_01: Tensor) -> list[Evidence]:
-        """The ``Evidence`` of every left image ``(N, 3, H, W)`` in [0, 1], native, on the device to use."""
+    def check_left_images(self, lefts_01: Tensor) -> None:
+        """Refuse left images ``(N, 3, H, W)`` that the right views, K or points do not belong to."""
         count, size = lefts_01.shape[0], image_size(lefts_01)
         if len(self.inputs) != count:
             images = "images (a tuple for several right views)"
@@ -329,11 +329,7 @@ class GeometryGuidance:
         if self._left_size not in (None, size[::-1]):
             width, height = self._left_size
             bad_value("image", f"of {width}x{height} pixels, as the left view", f"{size[1]}x{size[0]}")
-        used = self.updates.inner_steps > 0 or self.config.correct or self.config.crisp
-        needs_matches = used and bool(self.config.weights.get("matches"))
-        make = make_evidence if self.evidence_store is None else self.evidence_store.get
-        evidence = []
-        for i, (left_01, given) in enumerate(zip(lefts_01, self.inputs, strict=True)):
+        for i, given in enumerate(self.inputs):
             rights = [
                 (image_size(v.image_01) == size, r) for v, r in zip(given.views, given.rigs, strict=True)
             ]
@@ -342,9 +338,22 @@ class GeometryGuidance:
             checked = any(same and (r.K_right == r.K_left).all() for same, r in rights)
             if not (self._cropped or checked):  # by the constructor, with the right image
                 check_size_of(given.K_left, size, "K" if count == 1 else f"K[{i}]", "the left image")
-            with WithinCores():  # ``prepare`` may be called outside of a guided call
-                evidence.append(make(left_01, given, self.config, needs_matches, self.measured_baseline))
-        return evidence
+
+    def prepare(self, lefts_01: Tensor) -> list[Evidence]:
+        """The ``Evidence`` of every left image ``(N, 3, H, W)`` in [0, 1], native, on the device to use."""
+        self.check_left_images(lefts_01)
+        return self.evidence_of(lefts_01)
+
+    def evidence_of(self, lefts_01: Tensor) -> list[Evidence]:
+        """As ``prepare``, of images that ``check_left_images`` has seen already."""
+        used = self.updates.inner_steps > 0 or self.config.correct or self.config.crisp
+        needs_matches = used and bool(self.config.weights.get("matches"))
+        make = make_evidence if self.evidence_store is None else self.evidence_store.get
+        with WithinCores():  # may be called outside of a guided call
+            return [
+                make(left_01, given, self.config, needs_matches, self.measured_baseline)
+                for left_01, given in zip(lefts_01, self.inputs, strict=True)
+            ]
 
 
 def assume_same_centre(guidance: GeometryGuidance) -> None:

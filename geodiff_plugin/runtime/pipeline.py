@@ -16,6 +16,7 @@ from tqdm.auto import tqdm
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, noted, refuse, warn
 from geodiff_plugin.algorithm.prompt import depth_prompt
 from geodiff_plugin.algorithm.schedule import count_steps
+from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.messages import Message, distinct
@@ -23,6 +24,7 @@ from geodiff_plugin.priors import DepthPrior, prior_of
 from geodiff_plugin.priors.pipeline import RESAMPLING, DepthDiffusionPipeline
 from geodiff_plugin.result.ensemble import ensemble_metric
 from geodiff_plugin.result.output import image_labels
+from geodiff_plugin.runtime.beside import Beside
 from geodiff_plugin.runtime.estimate import ProcessingGrid, tiny_autoencoder
 from geodiff_plugin.runtime.hooks import Exclusive, networks_of
 from geodiff_plugin.runtime.noise_levels import check_scheduler
@@ -121,23 +123,29 @@ class GuidedCall(_Stock):
         device = self._execution_device
         lefts_01 = lefts_01.to(device)
         grid = self._processing_grid(lefts_01, call, device)
-        with torch.autocast(device.type, enabled=False):
-            evidence = guidance.prepare(lefts_01)
-            if prior.takes_prompt and call.get("prompt_depth") is None:
-                call["prompt_depth"] = depth_prompt(evidence, guidance.config)
-        # Channels last, as the stock call reads pictures; with given latents Marigold does not accept it.
-        layout = torch.channels_last if call["latents"] is None else torch.contiguous_format
-        call["image"] = lefts_01.contiguous(memory_format=layout)
-        inputs = RunInputs(guidance, evidence, call, grid, rounds)
-        run = GuidedRun(self, prior, inputs, callback, tiny, held)
+        guidance.check_left_images(lefts_01)
+        evidence = Beside(lambda: _prepared(guidance, lefts_01), device)
         try:
-            with run:
-                fixed = {"return_dict": True, "output_latent": True, "output_type": "pt"}
-                stock = super().__call__(**call | fixed)
+            if prior.takes_prompt and call.get("prompt_depth") is None:
+                call["prompt_depth"] = depth_prompt(evidence.result(), guidance.config)
+            # Channels last, as the stock call reads pictures; with given latents Marigold does not accept it.
+            layout = torch.channels_last if call["latents"] is None else torch.contiguous_format
+            call["image"] = lefts_01.contiguous(memory_format=layout)
+            inputs = RunInputs(guidance, evidence.result, call, grid, rounds)
+            run, stock = self._run_stock(GuidedRun(self, prior, inputs, callback, tiny, held), call)
         finally:
-            run.release()
+            evidence.close()
         run.check_finite()
         return run, stock
+
+    def _run_stock(self, run: GuidedRun, call: dict[str, Any]) -> tuple[GuidedRun, Any]:
+        """The stock call within a run; both, for the result."""
+        fixed = {"return_dict": True, "output_latent": True, "output_type": "pt"}
+        try:
+            with run:
+                return run, super().__call__(**call | fixed)
+        finally:
+            run.release()
 
     def _processing_grid(self, image: Any, call: dict[str, Any], device: torch.device) -> ProcessingGrid:
         """The grid that the stock call will denoise on, from the stock preprocessing."""
@@ -178,6 +186,12 @@ class GuidedCall(_Stock):
             twin = copy.copy(self)
         twin.__class__ = _stock_class(type(self))
         twin.save_pretrained(*args, **kwargs)
+
+
+def _prepared(guidance: GeometryGuidance, lefts_01: Tensor) -> list[Evidence]:
+    """Act 1, in float32 whatever the user's autocast."""
+    with torch.autocast(lefts_01.device.type, enabled=False):
+        return guidance.evidence_of(lefts_01)
 
 
 def _bind(stock_call: Callable[..., Any], *args: Any, **kwargs: Any) -> dict[str, Any]:

@@ -37,7 +37,7 @@ class RunInputs:
     """What a guided call starts from: act 1's evidence, and the stock call that act 2 runs in."""
 
     guidance: GeometryGuidance
-    evidence: Sequence[Evidence]  # one per image
+    evidence: Callable[[], Sequence[Evidence]]  # one per image; may have to be waited for
     call: Mapping[str, Any]  # arguments of the stock call
     grid: ProcessingGrid
     rounds: int = 1  # in each denoising step
@@ -61,15 +61,16 @@ class GuidedRun:
     ) -> None:
         guidance, call = inputs.guidance, inputs.call
         self.pipe, self.prior, self.config, self.inputs = pipe, prior, guidance.config, inputs
-        self._image_of_sample = [i for i in range(len(inputs.evidence)) for _ in range(call["ensemble_size"])]
+        self._image_of_sample = [i for i in range(len(guidance.inputs)) for _ in range(call["ensemble_size"])]
         self.schedule: Schedule | None = None
-        self.trajectories: list[Trajectory] = []  # one per chunk
+        self.trajectories: list[Trajectory] = []  # one per chunk, made at its first guided step
         self.members: list[Member] = []  # of all images, those of one image side by side
         self._plan = guidance.updates
         self._callback, self._held = callback, held
         self._reads_latents = call["output_latent"] or callback is not None
         self._codec = MapCodec(pipe, prior, inputs.grid, tiny)
-        self._step = 0
+        self._chunk, self._step = -1, 0
+        self._first_output: Tensor | None = None  # the network's, of the first step of the chunk
         self._timesteps: list[float] = []
         self._shown: Tensor | None = None  # relative map of the chunk's latest evaluation
         self._results: list[Tensor | None] = []  # of every chunk, the map that its output starts from
@@ -131,7 +132,7 @@ class GuidedRun:
         ``warned`` are the warnings so far; those that forbid trust are reasons of the verdict.
         """
         guidance, call = self.inputs.guidance, self.inputs.call
-        size, count = call["ensemble_size"], len(self.inputs.evidence)
+        size, count = call["ensemble_size"], len(guidance.inputs)
         members = [self.members[first : first + size] for first in range(0, count * size, size)]
         options = ResultOptions(
             self.config,
@@ -141,7 +142,7 @@ class GuidedRun:
             doubts=tuple(message for message in warned if message.forbids_trust),
         )
         spreads = [None] * count if stock.uncertainty is None else stock.uncertainty.split(1)
-        of_images = zip(self.inputs.evidence, members, stock.prediction.split(1), spreads, strict=True)
+        of_images = zip(self.inputs.evidence(), members, stock.prediction.split(1), spreads, strict=True)
         return stack_results(
             [finish(*of_image, options) for of_image in of_images],
             guidance,
@@ -158,42 +159,47 @@ class GuidedRun:
 
     def begin(self, timesteps: Tensor) -> None:
         """Start the trajectory of the next chunk, with its timesteps on the CPU."""
-        size = self.inputs.call["batch_size"]
-        first = len(self.trajectories) * size
-        chunk = slice(first, first + size)
-        plan, prior, metres = self._plan, self.prior, self.prior.metric_range
-        images = self._image_of_sample[chunk]
-        samples = Samples(
-            tuple(images),
-            tuple(self.inputs.evidence[i] for i in images),
-            None if prior.valid is None else prior.valid[chunk],
-        )
-        prior_range = None if metres is None else (metres[chunk, 0], metres[chunk, 1])
-        self.trajectories.append(
-            Trajectory(self.config, samples, prior.space, plan.step_latents, prior_range)
-        )
+        self._chunk += 1
         self._results.append(None)
-        self._step, self._timesteps, self._shown = 0, timesteps.tolist(), None
+        self._step, self._timesteps = 0, timesteps.tolist()
+        self._shown = self._first_output = None
         if self.schedule is None:
-            rounds, encodes = self.inputs.rounds, self._tap is None
-            self.schedule = make_schedule(self.config, plan, len(timesteps), rounds=rounds, encodes=encodes)
+            rounds, encodes, count = self.inputs.rounds, self._tap is None, len(timesteps)
+            self.schedule = make_schedule(self.config, self._plan, count, rounds=rounds, encodes=encodes)
             options = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
-            chunks = -(-len(self._image_of_sample) // size)
+            chunks = -(-len(self._image_of_sample) // self.inputs.call["batch_size"])
             self._bar = tqdm(total=chunks * len(timesteps), **options)
+
+    def _trajectory(self) -> Trajectory:
+        """The trajectory of the current chunk; the first one waits for the evidence, if it is still made."""
+        if len(self.trajectories) <= self._chunk:
+            size, prior, metres = self.inputs.call["batch_size"], self.prior, self.prior.metric_range
+            chunk = slice(self._chunk * size, (self._chunk + 1) * size)
+            images, evidence = self._image_of_sample[chunk], self.inputs.evidence()
+            valid = None if prior.valid is None else prior.valid[chunk]
+            samples = Samples(tuple(images), tuple(evidence[i] for i in images), valid)
+            prior_range = None if metres is None else (metres[chunk, 0], metres[chunk, 1])
+            trajectory = Trajectory(self.config, samples, prior.space, self._plan.step_latents, prior_range)
+            if self._first_output is not None:
+                trajectory.step = 0, self._timesteps[0]
+                trajectory.note("the prior's output", self._first_output)
+            self.trajectories.append(trajectory)
+        return self.trajectories[self._chunk]
 
     def guide(self, output: Tensor, timestep: Tensor, z_t: Tensor) -> StepInputs:
         """Guide one step: what the scheduler's step gets instead of ``output`` and ``z_t (B, C, h, w)``."""
-        trajectory, schedule = self.trajectories[-1], self.schedule
+        schedule = self.schedule
         assert schedule is not None  # of begin
-        trajectory.step = self._step, self._timesteps[self._step]
         level, is_last = noise_level(self.pipe.scheduler, timestep), schedule.is_last(self._step)
         latent_is_read = self._reads_latents or not is_last
         estimate = StepEstimate(self._codec, level, output, z_t, self._tap, latent_is_read)
         if self._step == 0:
-            trajectory.note("the prior's output", estimate.output)
+            self._first_output = estimate.output
         inputs: StepInputs = output, z_t, None  # unchanged, for the stock step bit for bit
         self._results[-1] = None
         if rounds := schedule.steps[self._step]:
+            trajectory = self._trajectory()
+            trajectory.step = self._step, self._timesteps[self._step]
             with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
                 step = guided_step(trajectory, estimate, rounds, is_last)
             self._shown = step.relative
@@ -218,7 +224,7 @@ class GuidedRun:
                 self._results[-1] = None
         self._step += 1
         if self._bar is not None:
-            history = self.trajectories[-1].history
+            history = self._trajectory().history if self._shown is not None else []
             loss = history[-1].loss if history else None
             # Reading from a GPU would wait for it.
             if loss is not None and not self._bar.disable and loss.device.type == "cpu":
@@ -227,9 +233,10 @@ class GuidedRun:
         return latents
 
     def _seen_by_callback(self, latents: Tensor) -> dict[str, Tensor | None]:
-        trajectory, x = self.trajectories[-1], self._shown
+        x = self._shown
         if x is None:  # steps before the first correction are not guided
             return dict.fromkeys(("metric_depth", "loss", "scale", "shift"))
+        trajectory = self._trajectory()
         if self._step == len(self._timesteps) - 1:
             x = self._codec.decode(latents[:, self.prior.depth_channels], final=True)
         return {
