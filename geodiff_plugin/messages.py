@@ -429,6 +429,11 @@ MESSAGES: dict[str, MessageKind] = {
         cause="It has several models, splits or cameras, of which one is taken.",
         cure="Name the file or folder of another one to take that.",
     ),
+    "capture.gps-scale": MessageKind(
+        "The capture was aligned with GPS",
+        cause="OpenSfM fitted its reconstruction to positions that are exact to some metres.",
+        cure="Give --metres-per-unit 1 to take its lengths as metres, or a length that you measured.",
+    ),
     "capture.stored-pixels": MessageKind(
         "The EXIF orientation of frames is not applied",
         cause="The cameras of the capture are those of the pixels as the image files store them.",

@@ -10,6 +10,13 @@ import numpy as np
 
 from geodiff_plugin._checks import InputError, MissingFileError, bad_value
 from geodiff_plugin.formats.colmap import read_colmap_capture
+from geodiff_plugin.formats.datasets import (
+    read_euroc,
+    read_kitti_odometry,
+    read_log,
+    read_mvsnet_folder,
+    read_tartanair,
+)
 from geodiff_plugin.formats.files import PathLike, is_turned, stored_size, upright_size
 from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.formats.layouts import (
@@ -20,9 +27,12 @@ from geodiff_plugin.formats.layouts import (
     Layout,
     unique_names,
 )
+from geodiff_plugin.formats.phones import read_polycam, read_record3d, read_stray
+from geodiff_plugin.formats.photogrammetry import read_bundler, read_metashape, read_nvm, read_opensfm
 from geodiff_plugin.formats.rigs import RATIO_TOLERANCE, Camera, lens_of, reading_whole, resized
 from geodiff_plugin.formats.sequences import read_photographs, read_tracked, read_tum, read_video
 from geodiff_plugin.formats.transforms import read_transforms
+from geodiff_plugin.formats.unknown import refuse_foreign, refuse_unknown
 from geodiff_plugin.messages import Message
 
 #: Names and reasons that a note gives of frames that are left out.
@@ -32,8 +42,21 @@ MOST_NAMES, MOST_REASONS = 5, 3
 LAYOUTS = (
     CaptureFormat("a transforms.json", ("transforms*.json",), read_transforms),
     CaptureFormat("a COLMAP model", ("**/cameras.*", "**/images.*"), read_colmap_capture),
-    CaptureFormat("7-Scenes or ScanNet", ("pose", "color"), read_tracked),
+    CaptureFormat("Polycam's raw data", ("keyframes/*cameras", "keyframes/*images"), read_polycam),
+    CaptureFormat("Record3D", ("metadata.json", "rgb"), read_record3d),
+    CaptureFormat("Stray Scanner", ("odometry.csv", "camera_matrix.csv", "rgb.mp4"), read_stray),
+    CaptureFormat("7-Scenes", ("frame-*.color.*", "frame-*.pose.txt"), read_tracked),
+    CaptureFormat("ScanNet", ("color", "pose", "intrinsic"), read_tracked),
     CaptureFormat("TUM RGB-D", ("rgb.txt", "groundtruth.txt"), read_tum),
+    CaptureFormat("EuRoC", ("*/cam0/sensor.yaml", "*/cam0/data.csv"), read_euroc),
+    CaptureFormat("TartanAir", ("image_left", "pose_left.txt"), read_tartanair),
+    CaptureFormat("KITTI odometry", ("image_[0-3]", "calib.txt", "poses.txt"), read_kitti_odometry),
+    CaptureFormat("MVSNet", ("cams/*_cam.txt", "*images"), read_mvsnet_folder),
+    CaptureFormat("Metashape", ("*.xml",), read_metashape),
+    CaptureFormat("OpenSfM", ("*reconstruction*.json",), read_opensfm),
+    CaptureFormat("Bundler", ("*.out", "list*.txt"), read_bundler),
+    CaptureFormat("VisualSFM", ("*.nvm",), read_nvm),
+    CaptureFormat("Tanks and Temples", ("*.log",), read_log),
     CaptureFormat("a video", ("*.mp4",), read_video),
     CaptureFormat("images", ("*.jpg",), read_photographs),
 )
@@ -86,12 +109,10 @@ def _layout(source: Path, trajectory: Path | None) -> Layout:
         if layout is None:
             bad_value("trajectory (--trajectory)", "left out where the capture is not a video", trajectory)
         return layout
+    refuse_foreign(source)
     found = (layout.read(source) for layout in LAYOUTS)
     layout = next((each for each in found if each is not None), None)
-    if layout is None:
-        expected = ", ".join(each.summary for each in LAYOUTS)
-        bad_value("PATH", expected, f"{source}, which is none of these")
-    return layout
+    return layout or refuse_unknown(source, LAYOUTS)
 
 
 def _left_out(candidate: Candidate, problem: str) -> Candidate:

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
+from xml.etree import ElementTree
 
 from geodiff_plugin._checks import InputError, InputFileError, MissingFileError, bad_type, bad_value
 
@@ -128,6 +129,13 @@ def read_text(path: PathLike, name: str, what: str = "a text file") -> str:
     if "\0" in text or not text.strip():
         bad_value(name, what, f"{file}, which holds {'binary data' if text.strip() else 'only blanks'}", cure)
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def parse_xml(text: str) -> ElementTree.Element:
+    """The root of an XML text; entities of its own, which may grow without end, are refused."""
+    if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
+        bad_value("the file", "an XML file", "a document type with entities", "Remove it.")
+    return ElementTree.fromstring(text.strip())
 
 
 def read_rows(path: PathLike, name: str, what: str) -> list[list[str]]:

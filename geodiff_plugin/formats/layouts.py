@@ -113,15 +113,18 @@ class Images:
         self._files = dict(zip(names, find_images(names, folders), strict=True))
         below = project if project.is_dir() else project.parent
         places = [os.path.relpath(folder, below) for folder in folders]
+        self._used = set[str]()
         self._searched = ", ".join("its folder" if at == "." else at for at in places) or "any folder"
 
     def candidate(self, name: str, build: Callable[[CaptureFrame], Candidate]) -> Candidate:
         """The candidate that ``build`` makes of a frame with its name and file, if there is one."""
-        file = self._files[name]
-        if file is not None:
+        file, twice = self._files[name], name in self._used
+        self._used.add(name)
+        if file is not None and not twice:
             return build_frame(CaptureFrame(file.stem, file), build)
         missing = Path(name.replace("\\", "/"))
-        return Candidate(CaptureFrame(missing.name, missing), None, f"{NO_IMAGE} in {self._searched}")
+        problem = "named twice; the first is used" if twice else f"{NO_IMAGE} in {self._searched}"
+        return Candidate(CaptureFrame(missing.name, missing), None, problem)
 
 
 def find_images(names: Sequence[str], folders: Sequence[Path]) -> list[Path | None]:

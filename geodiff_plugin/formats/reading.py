@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin._checks import bad_type, bad_value, check_number, warn
-from geodiff_plugin.formats import colmap, stereo, transforms
+from geodiff_plugin.formats import colmap, devices, robotics, stereo, storage, transforms
 from geodiff_plugin.formats.files import PathLike
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
 from geodiff_plugin.messages import Message
@@ -35,29 +35,29 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "mvsnet": CalibrationFormat(
         "pair of MVSNet cam.txt (extrinsic)", r"^\s*extrinsic\s*$", stereo.read_mvsnet, (2,)),
     "zed": CalibrationFormat(
-        "ZED SN*.conf ([LEFT_CAM_HD])", r"^\s*\[(LEFT|RIGHT)_CAM_\w+\]", stereo.read_zed),
+        "ZED SN*.conf ([LEFT_CAM_HD])", r"^\s*\[(LEFT|RIGHT)_CAM_\w+\]", devices.read_zed),
     "realsense": CalibrationFormat(
         "RealSense (rs-enumerate-devices -c, or rs2 as JSON)",
-        rf'{stereo.RS_PRINTED}|{_JSON}(?=[\s\S]*"ppx")', stereo.read_realsense),
+        rf'{devices.RS_PRINTED}|{_JSON}(?=[\s\S]*"ppx")', devices.read_realsense),
     "oak": CalibrationFormat(
-        "OAK-D JSON (cameraData)", _JSON + r'(?=[\s\S]*"cameraData")', stereo.read_oak, uses_cameras=True),
+        "OAK-D JSON (cameraData)", _JSON + r'(?=[\s\S]*"cameraData")', devices.read_oak, uses_cameras=True),
     "nerf": CalibrationFormat(
         "transforms.json of nerfstudio or instant-ngp (frames, transform_matrix)",
         _JSON + r'(?=[\s\S]*"frames")(?=[\s\S]*"transform_matrix")', transforms.read_nerf, by_image=True,
         as_stored=True),
     "kalibr": CalibrationFormat(
-        "Kalibr camchain.yaml (cam0)", r"^cam\d+:\s*(?:#.*)?$", stereo.read_kalibr, uses_cameras=True),
-    "euroc": CalibrationFormat("pair of EuRoC sensor.yaml (T_BS)", r"^T_BS\s*:", stereo.read_euroc, (2,)),
+        "Kalibr camchain.yaml (cam0)", r"^cam\d+:\s*(?:#.*)?$", robotics.read_kalibr, uses_cameras=True),
+    "euroc": CalibrationFormat("pair of EuRoC sensor.yaml (T_BS)", r"^T_BS\s*:", robotics.read_euroc, (2,)),
     # Older settings describe the rectification too, and OpenCV's reader has these names.
     "orb_slam": CalibrationFormat(
         "ORB-SLAM's stereo settings (Camera1.fx, Camera.bf)",
-        r"\A(?![\s\S]*^LEFT\.P[ \t]*:)[\s\S]*^(?:Camera1?\.fx|Camera\.bf)[ \t]*:", stereo.read_orb_slam),
+        r"\A(?![\s\S]*^LEFT\.P[ \t]*:)[\s\S]*^(?:Camera1?\.fx|Camera\.bf)[ \t]*:", robotics.read_orb_slam),
     "opencv": CalibrationFormat(
         "OpenCV YAML, XML or JSON (P1, P2, or M1, M2, R, T)",
-        r'!!opencv-matrix|<opencv_storage|"opencv-matrix"', stereo.read_opencv, (1, 2)),
+        r'!!opencv-matrix|<opencv_storage|"opencv-matrix"', storage.read_opencv, (1, 2)),
     "ros": CalibrationFormat(
         "pair of ROS camera_info (projection_matrix)",
-        r"^(projection_matrix|distortion_model|rectification_matrix)\s*:", stereo.read_ros, (2,)),
+        r"^(projection_matrix|distortion_model|rectification_matrix)\s*:", robotics.read_ros, (2,)),
     "stereodemo": CalibrationFormat(
         "stereodemo JSON (fx)", _JSON + r'(?=[\s\S]*"fx")', stereo.read_stereodemo),
     "colmap": CalibrationFormat(

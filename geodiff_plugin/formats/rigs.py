@@ -11,6 +11,7 @@ from pathlib import PurePath
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._camera_checks import check_intrinsics, check_pose
 from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_positive, refuse
@@ -135,6 +136,13 @@ def transform(rotation: Any, translation: Any, name: str) -> np.ndarray:
     """The ``(4, 4)`` float64 rigid transform of a rotation of 9 numbers, row by row, and a translation."""
     R = array_of(rotation, (3, 3), f"the rotation of {name}")
     return rigid(np.column_stack([R, array_of(translation, (3,), f"the translation of {name}")]), name)
+
+
+def pose_of(turn: Rotation, place: Any) -> np.ndarray:
+    """The ``(4, 4)`` pose of a rotation and a place."""
+    E = np.eye(4)
+    E[:3, :3], E[:3, 3] = turn.as_matrix(), array_of(place, (3,), "a place")
+    return E
 
 
 def resized(camera: Camera, size: Size, name: str, cure: str) -> Camera:

@@ -141,13 +141,10 @@ def read_transforms(path: Path) -> Layout | None:
         return None
     frames = list(nerf_frames(text))
     images = Images([str(frame["file_path"]) for frame in frames], _folders(file), file)
-    candidates, named = [], set[str]()
-    for name, entries in zip(images.names, frames, strict=True):
-        candidate = images.candidate(name, partial(_build, entries=entries, folder=file.parent))
-        if name in named:
-            candidate = replace(candidate, problem="named twice; the first is used")
-        candidates.append(candidate)
-        named.add(name)
+    candidates = [
+        images.candidate(name, partial(_build, entries=entries, folder=file.parent))
+        for name, entries in zip(images.names, frames, strict=True)
+    ]
     solved = any(key in entries for entries in frames for key in OF_COLMAP)
     return Layout("transforms.json", None if solved else "m", candidates, as_stored=True, notes=_notes(file))
 

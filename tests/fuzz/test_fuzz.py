@@ -19,10 +19,13 @@ from geodiff_plugin import GeometryGuidance
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.config import KNOBS
 from geodiff_plugin.formats import as_image_01, read_calibration, read_image, read_matrix, read_points
+from geodiff_plugin.formats.captures import read_capture
 from geodiff_plugin.formats.images import warn_of_other_lens
 from geodiff_plugin.formats.out import check_out
 from geodiff_plugin.jobs.pairs import is_many
 from tests.contracts.calibrations import SAMPLES, choice, written
+from tests.contracts.captures import WRITERS
+from tests.unit.test_capture_files import colmap_text, transforms
 
 COMMON: dict[str, Any] = {
     "deadline": None,
@@ -174,6 +177,28 @@ def test_calibrations(tmp_path, sample, size):
         return read_calibration(paths, cameras=chosen, **given_too)
 
     survives_damage(size, last, SAMPLES[sample][-1].encode(), read, cameras)
+
+
+@pytest.mark.parametrize("write", WRITERS, ids=lambda write: write.__name__)
+def test_captures(tmp_path, write, size):
+    """Damage in one file leaves a capture of the other frames, or a sentence."""
+    twin = write(tmp_path / "scan")
+
+    def read(fov):
+        read_capture(twin.path, K=twin.typed, fov=fov)
+
+    path = twin.path / twin.file
+    survives_damage(size, path, path.read_bytes(), read, st.sampled_from([None, None, 60.0]))
+
+
+@pytest.mark.parametrize(
+    "file", ["transforms.json", *(f"sparse/0/{n}.txt" for n in ("cameras", "images", "points3D"))]
+)
+def test_transforms_and_colmap(tmp_path, file, size):
+    folder = (transforms if "json" in file else colmap_text)(tmp_path / "scan")
+    survives_damage(
+        size, folder / file, (folder / file).read_bytes(), lambda _: read_capture(folder), st.none()
+    )
 
 
 @pytest.mark.parametrize("suffix", POINT_FILES)

@@ -1,0 +1,162 @@
+"""Calibrations that stereo cameras keep: ZED, RealSense, OAK-D."""
+
+from __future__ import annotations
+
+import configparser
+import json
+import re
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.rigs import (
+    Camera,
+    CameraChoice,
+    array_of,
+    intrinsics,
+    make_rig,
+    of_size,
+    resized,
+    transform,
+    two_cameras,
+)
+from geodiff_plugin.types import Rig
+
+MM_PER_METRE, CM_PER_METRE = 1000.0, 100.0
+ZED_SIZES = {
+    **{"4K": (3840, 2160), "QHDPLUS": (3200, 1800), "2K": (2208, 1242), "FHD1200": (1920, 1200)},
+    **{"FHD": (1920, 1080), "HD": (1280, 720), "SVGA": (960, 600), "VGA": (672, 376)},
+}
+#: In OpenCV's order, which is that of its models with 5 and with 8 coefficients.
+ZED_LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+RS_PRINTED = r'^\s*Intrinsic of "'
+RS_INTRINSIC = re.compile(
+    r'^\s*Intrinsic of "Infrared ([12])" */ *\d+x\d+[^\n]*\n(.*?)(?=\n\s*\n|\Z)', re.M | re.S
+)
+RS_EXTRINSIC = re.compile(
+    r'^\s*Extrinsic from "Infrared 1"\s+To\s+"Infrared 2"[^\n]*\n(.*?)(?=\n\s*Extrinsic|\Z)', re.M | re.S
+)
+NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
+#: CAM_B and CAM_C, an OAK-D's left and right camera.
+OAK_PAIR = (1, 2)
+Entries = dict[str, Any]
+Sockets = dict[int, Entries]
+
+
+def read_zed(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """The raw images of ``SN<number>.conf`` at the resolution of ``choice.image_size``; millimetres.
+
+    ``x_right = Rodrigues(RX, CV, RZ) x_left - T``. Source: calibration.hpp of stereolabs/zed-opencv-native.
+    """
+    parser = configparser.ConfigParser(strict=False, interpolation=None)
+    parser.read_string(texts[0])
+    sections: dict[str, Entries] = {name: dict(section) for name, section in parser.items()}
+    there = [name for name in ZED_SIZES if {f"LEFT_CAM_{name}", f"RIGHT_CAM_{name}"} <= sections.keys()]
+    name = of_size({ZED_SIZES[name]: name for name in there}, choice)
+    cameras = []
+    for side in ("LEFT", "RIGHT"):
+        section = sections[f"{side}_CAM_{name}"]
+        lens = sections.get(f"{side}_DISTO", {}) | section
+        keys = ZED_LENS if lens.keys() & set(ZED_LENS[5:]) else ZED_LENS[:5]
+        K = intrinsics(*(section[key] for key in ("fx", "fy", "cx", "cy")))
+        cameras.append(Camera(K, ZED_SIZES[name], [lens.get(key, 0.0) for key in keys]))
+    # Keys are small here; per resolution in some files (TY_HD), once for all in others (TY).
+    stereo, at = sections["STEREO"], f"_{name.lower()}"
+    shift = [stereo["baseline"], *(stereo.get(key + at, stereo.get(key)) for key in ("ty", "tz"))]
+    turn = array_of([stereo[key + at] for key in ("rx", "cv", "rz")], (3,), "RX, CV, RZ of [STEREO]")
+    shift_m = -array_of(shift, (3,), "Baseline, TY, TZ of [STEREO]") / MM_PER_METRE
+    T = transform(Rotation.from_rotvec(turn).as_matrix(), shift_m, "[STEREO]")
+    return make_rig(cameras[0], cameras[1], np.linalg.inv(T))
+
+
+def _rs_camera(values: Entries) -> Camera:
+    """A camera of rs2's entries; a lens of coefficients 0 is none, whatever its model."""
+    K = intrinsics(*(values[key] for key in ("fx", "fy", "ppx", "ppy")))
+    coefficients = array_of(values.get("coeffs", ()), (-1,), "coeffs")
+    model = re.sub(r"^.*distortion|[^a-z0-9]", "", str(values.get("model", "none")).lower())
+    model = {"4": "brownconrady", "5": "kannalabrandt4"}.get(model, model)  # the numbers of rs2_distortion
+    if model != "kannalabrandt4" and not coefficients.any():
+        model = "none"
+    return Camera(K, (values["width"], values["height"]), coefficients, model)
+
+
+def _rs_printed(text: str, choice: CameraChoice) -> tuple[Camera, Camera, np.ndarray]:
+    """Of what ``rs-enumerate-devices -c`` prints, which holds every resolution."""
+    cameras: dict[str, dict[tuple[int, int], Camera]] = {"1": {}, "2": {}}
+    for side, block in RS_INTRINSIC.findall(text):
+        pairs = (line.partition(":") for line in block.splitlines())
+        values: Entries = {key.strip().lower(): value.strip() for key, _, value in pairs}
+        values |= {"coeffs": NUMBER.findall(values.get("coeffs", "")), "model": values.get("distortion")}
+        cameras[side].setdefault((int(values["width"]), int(values["height"])), _rs_camera(values))
+    left, right = (of_size(cameras[side], choice) for side in "12")
+    between = [*RS_EXTRINSIC.findall(text), ""][0]
+    rotation, translation = (NUMBER.findall(part) for part in between.partition("Translation")[::2])
+    return left, right, transform(rotation[:9], translation[:3], "the extrinsics")
+
+
+def _rs_json(text: str) -> tuple[Camera, Camera, np.ndarray]:
+    """Of ``rs2_intrinsics``, left before right, and ``rs2_extrinsics`` between them, under any names."""
+    objects = list[Entries]()
+    json.loads(text, object_hook=objects.append)
+    views = [values for values in objects if "ppx" in values]
+    between = [values for values in objects if "translation" in values]
+    if len(views) != 2 or len(between) != 1:
+        expected = "two rs2 intrinsics (fx, fy, ppx, ppy), of the infrared pair, and their extrinsics alone"
+        bad_value("the file", expected, f"{len(views)} and {len(between)}", "Is the file cut off?")
+    # rs2 keeps a rotation column by column.
+    R = array_of(between[0]["rotation"], (3, 3), "the rotation of the extrinsics").T
+    T = transform(R, between[0]["translation"], "the extrinsics")
+    # From the left to the right one x becomes smaller; a file that says it the other way round is inverted.
+    return _rs_camera(views[0]), _rs_camera(views[1]), T if T[0, 3] <= 0 else np.linalg.inv(T)
+
+
+def read_realsense(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """The infrared pair, whose images the camera rectifies itself, or the T265's fisheyes."""
+    printed = re.search(RS_PRINTED, texts[0], re.MULTILINE)
+    left, right, T = _rs_printed(texts[0], choice) if printed else _rs_json(texts[0])
+    return make_rig(left, right, np.linalg.inv(T), rectified=True)
+
+
+def _oak_camera(cameras: Sockets, socket: int, choice: CameraChoice, with_lens: bool) -> Camera:
+    """The camera, at another resolution of the whole sensor where one is asked for."""
+    entries = cameras[socket]
+    K = array_of(entries["intrinsicMatrix"], (3, 3), f"intrinsicMatrix of socket {socket}")
+    lens = (entries["distortionCoeff"], f"cameraType {entries.get('cameraType', 0)}") if with_lens else ()
+    camera = Camera(K, (entries["width"], entries["height"]), *lens)
+    cure = "It is a crop of the sensor: give --fx --fy --cx --cy --baseline of the cropped image."
+    return resized(camera, choice.image_size or camera.size, "the left image", cure)
+
+
+def _oak_links(cameras: Sockets, socket: int) -> dict[int, np.ndarray]:
+    """For every camera along the links from ``socket``: takes points of ``socket`` to it, in metres."""
+    reached, T = {socket: np.eye(4)}, np.eye(4)
+    while True:
+        link, where = cameras[socket]["extrinsics"], f"extrinsics of socket {socket}"
+        socket = link["toCameraSocket"]
+        if socket not in cameras or socket in reached:
+            return reached
+        shift_cm = array_of([link["translation"][axis] for axis in "xyz"], (3,), where)
+        T = transform(link["rotationMatrix"], shift_cm / CM_PER_METRE, where) @ T
+        reached[socket] = T
+
+
+def read_oak(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """The cameras as they stand, or, by rectifying rotations, ``StereoDepth``'s, with the right one's K."""
+    data = json.loads(texts[0])
+    cameras: Sockets = dict(data["cameraData"])  # pairs of a socket and its camera
+    stereo = data.get("stereoRectificationData") or {}
+    pair = stereo.get("leftCameraSocket", OAK_PAIR[0]), stereo.get("rightCameraSocket", OAK_PAIR[1])
+    pair = pair if min(pair) >= 0 else OAK_PAIR
+    left, right = two_cameras(choice, cameras, pair)
+    rectified = (left, right) == pair and bool(stereo.get("rectifiedRotationLeft"))
+    first, second = (_oak_camera(cameras, socket, choice, not rectified) for socket in (left, right))
+    from_left, from_right = _oak_links(cameras, left), _oak_links(cameras, right)
+    common = next((socket for socket in from_left if socket in from_right), None)
+    if common is None:
+        bad_value("extrinsics", f"a way from socket {left} to {right}", "none", "Calibrate again.")
+    E = np.linalg.inv(from_left[common]) @ from_right[common]
+    if rectified:
+        return make_rig(second, second, float(np.linalg.norm(E[:3, 3])), rectified=True)
+    return make_rig(first, second, E)

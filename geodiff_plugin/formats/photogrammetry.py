@@ -1,0 +1,240 @@
+"""Photogrammetry and older structure from motion: Metashape, OpenSfM, Bundler, VisualSFM; none has a unit.
+
+Source: ``process_data/metashape_utils.py`` of nerfstudio-project/nerfstudio and the camera models of
+Metashape's manual; ``doc/source/geometry.rst`` and ``dataset.rst`` of mapillary/OpenSfM; ``README.md`` of
+snavely/bundler_sfm; ``scene/reconstruction_io.cc`` (``ExportBundler``, ``ExportNVM``) of colmap/colmap.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin.formats.files import check_file, parse_xml, read_text, stored_size
+from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout, image_folders
+from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, pose_of, rigid
+from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
+from geodiff_plugin.messages import Message
+
+#: Metashape's terms of a lens that OpenCV's model does not have; others are read.
+NO_LENS_TERMS = ("k4", "p3", "p4")
+UNDISTORT = "Undistort in Metashape (File, Export, Convert Images) and export its cameras."
+#: OpenSfM's projections, by OpenCV's model, and their coefficients in its order.
+OPENSFM_LENSES = {
+    "perspective": ("opencv", ("k1", "k2", "", "")),
+    "simple_radial": ("opencv", ("k1", "", "", "")),
+    "radial": ("opencv", ("k1", "k2", "", "")),
+    "brown": ("opencv", ("k1", "k2", "p1", "p2", "k3")),
+    "fisheye": ("fisheye", ("k1", "k2", "", "")),
+    "fisheye_opencv": ("fisheye", ("k1", "k2", "k3", "k4")),
+}
+#: Names of the list of images that belongs to a file of Bundler.
+LISTS = ("list.txt", "pictures.txt", "bundle.out.list.txt")
+Entries = dict[str, Any]
+
+
+def _files(path: Path, *patterns: str) -> Iterator[Path]:
+    """The path itself where it is a file of one of the patterns, else those of a folder, in order."""
+    if path.is_file():
+        yield from [path] if any(path.match(pattern) for pattern in patterns) else []
+    else:
+        yield from (file for pattern in patterns for file in sorted(path.glob(pattern)) if file.is_file())
+
+
+# Metashape
+
+
+def read_metashape(path: Path) -> Layout | None:
+    """Metashape's ``cameras.xml``: camera-to-world poses, in metres where the chunk has a scale."""
+    for file in _files(path, "*.xml"):
+        text = read_text(file, "PATH")
+        if "<chunk" in text and "<camera" in text:
+            return _metashape(file, parse_xml(text))
+    return None
+
+
+def _metashape(file: Path, root: Element) -> Layout:
+    sensors: dict[str | None, Camera | str] = {}
+    for sensor in root.iter("sensor"):
+        try:
+            sensors[sensor.get("id")] = _metashape_camera(sensor)
+        except InputError as error:
+            sensors[sensor.get("id")] = str(error)
+    scale = next((float(node.text or 1) for node in root.iter("scale")), 1.0)
+    cameras = [camera for camera in root.iter("camera") if camera.get("label")]
+    images = Images([str(camera.get("label")) for camera in cameras], image_folders(file.parent), file)
+
+    def build(frame: CaptureFrame, camera: Element) -> Candidate:
+        sensor = sensors.get(camera.get("sensor_id"), "its sensor is not in the file")
+        if isinstance(sensor, str):
+            raise InputError(sensor)
+        matrix = camera.findtext("transform")
+        if matrix is None:
+            return Candidate(frame, sensor)
+        E = rigid(matrix.split(), "transform")
+        E[:3, 3] *= scale
+        return Candidate(replace(frame, E=E), sensor)
+
+    pairs = zip(images.names, cameras, strict=True)
+    candidates = [images.candidate(name, partial(build, camera=camera)) for name, camera in pairs]
+    return Layout("Metashape", None if scale == 1.0 else "m", candidates)
+
+
+def _metashape_camera(sensor: Element) -> Camera:
+    """The adjusted camera of a sensor; P1 and P2 change places in OpenCV's order."""
+    kind = sensor.get("type", "frame")
+    if kind != "frame":
+        bad_value("a sensor of Metashape", "of type frame", kind, UNDISTORT)
+    found = sensor.findall("calibration")
+    adjusted = (each for each in found if each.get("class") == "adjusted")
+    calibration = next(adjusted, next(iter(found), None))
+    if calibration is None:
+        cure = "Align the cameras first; without it a sensor has no focal length."
+        bad_value("a sensor of Metashape", "calibrated", "no calibration", cure)
+    value = {node.tag: float(node.text or 0) for node in calibration if node.tag != "resolution"}
+    others = {term: value[term] for term in NO_LENS_TERMS if value.get(term)}
+    if others:
+        bad_value("the lens of a sensor", f"without {', '.join(others)}", others, UNDISTORT)
+    resolution = calibration.find("resolution")
+    resolution = sensor.find("resolution") if resolution is None else resolution
+    if resolution is None:
+        bad_value("a sensor of Metashape", "with a resolution", "none")
+    width, height = (int(resolution.get(side, 0)) for side in ("width", "height"))
+    f = value.get("f", value.get("fy", 0.0))
+    centre = width / 2 + value.get("cx", 0.0) - 0.5, height / 2 + value.get("cy", 0.0) - 0.5
+    K = intrinsics(f + value.get("b1", 0.0), f, *centre)
+    K[0, 1] = value.get("b2", 0.0)
+    lens = [value.get(key, 0.0) for key in ("k1", "k2", "p2", "p1", "k3")]
+    return Camera(K, (width, height), lens)
+
+
+# OpenSfM
+
+
+def read_opensfm(path: Path) -> Layout | None:
+    """OpenSfM's ``reconstruction.json``, its largest part; poses are world-to-camera."""
+    for file in _files(path, "*reconstruction*.json", "opensfm/reconstruction.json"):
+        data = json.loads(read_text(file, "PATH"))
+        if isinstance(data, list) and data and all("shots" in each and "cameras" in each for each in data):
+            return _opensfm(file, data)
+    return None
+
+
+def _opensfm(file: Path, data: list[Entries]) -> Layout:
+    part = max(data, key=lambda each: len(each["shots"]))
+    shots = sorted(part["shots"].items())
+    folders = image_folders(file.parent, file.parent.parent)
+    images = Images([name for name, _ in shots], folders, file)
+
+    def build(frame: CaptureFrame, shot: Entries) -> Candidate:
+        turn = Rotation.from_rotvec(array_of(shot["rotation"], (3,), "rotation"))
+        T = pose_of(turn, shot["translation"])
+        return Candidate(replace(frame, E=np.linalg.inv(T)), _opensfm_camera(part["cameras"][shot["camera"]]))
+
+    candidates = [images.candidate(name, partial(build, shot=shot)) for name, shot in shots]
+    notes = list[Message]()
+    if len(data) > 1:
+        sizes = ", ".join(str(len(each["shots"])) for each in data if each is not part)
+        sentence = f"The largest part, of {len(shots)} images, is used; left out: parts of {sizes}."
+        notes.append(Message("capture.part", sentence))
+    if (file.parent / "reference_lla.json").is_file():
+        sentence = "Its lengths are metres as exact as its GPS: give --metres-per-unit 1 to take them."
+        notes.append(Message("capture.gps-scale", sentence))
+    return Layout("OpenSfM", None, candidates, notes=tuple(notes))
+
+
+def _opensfm_camera(entries: Entries) -> Camera:
+    """A camera in shares of the longer side; its first pixel's centre is at (0, 0), as ours."""
+    kind = entries.get("projection_type", "perspective")
+    if kind not in OPENSFM_LENSES:
+        bad_value("projection_type", f"one of {', '.join(OPENSFM_LENSES)}", kind, "Run opensfm undistort.")
+    model, names = OPENSFM_LENSES[kind]
+    width, height = int(entries["width"]), int(entries["height"])
+    longer = max(width, height)
+    fx, fy = (entries.get(key, entries.get("focal")) for key in ("focal_x", "focal_y"))
+    fx, fy = array_of((fx, fy), (2,), "focal") * longer
+    centre = [
+        entries.get(key, 0.0) * longer + (side - 1) / 2 for key, side in (("c_x", width), ("c_y", height))
+    ]
+    return Camera(intrinsics(fx, fy, *centre), (width, height), [entries.get(n, 0.0) for n in names], model)
+
+
+# Bundler and VisualSFM
+
+
+def read_bundler(path: Path) -> Layout | None:
+    """Bundler's ``bundle.out`` and its list of images: world-to-camera, OpenGL's axes, central cameras."""
+    for file in _files(path, "*.out", "bundle/*.out"):
+        with file.open(encoding="utf-8", errors="replace") as opened:
+            if opened.readline().startswith("# Bundle file"):
+                return _bundler(file, opened.readline(), opened)
+    return None
+
+
+def _bundler(file: Path, counts: str, lines: Iterator[str]) -> Layout:
+    above = (file.parent, file.parent.parent)
+    names_of = [folder / name for folder in above for name in (f"{file}.list.txt", *LISTS)]
+    listed = next((each for each in names_of if each.is_file()), names_of[1])
+    text = read_text(check_file(listed, "the list of images"), "the list of images")
+    names = [line.split()[0] for line in text.splitlines() if line.strip()]
+    count = int(counts.split()[0])
+    if count != len(names):
+        bad_value(f"{listed.name}", f"of the {count} images of {file.name}", f"{len(names)}")
+    images = Images(names, image_folders(*above), file)
+
+    def build(frame: CaptureFrame, rows: list[str]) -> Candidate:
+        f, k1, k2 = array_of(rows[0].split(), (3,), "f k1 k2")
+        if f == 0:  # an image that was not registered
+            return Candidate(frame)
+        R, t = (array_of(" ".join(part).split(), (-1,), "R, t") for part in (rows[1:4], rows[4:5]))
+        T = np.vstack([np.column_stack([R.reshape(3, 3), t]), (0, 0, 0, 1)])
+        E = np.linalg.inv(rigid(T, "R, t")) @ OPENGL_FROM_OPENCV
+        return Candidate(replace(frame, E=E), _central(frame, f, (k1, k2, 0.0, 0.0)))
+
+    blocks = [[next(lines, "") for _ in range(5)] for _ in names]
+    pairs = zip(images.names, blocks, strict=True)
+    candidates = [images.candidate(name, partial(build, rows=rows)) for name, rows in pairs]
+    return Layout("Bundler", None, candidates)
+
+
+def _central(frame: CaptureFrame, f: float, coefficients: tuple[float, ...]) -> Camera:
+    """A camera whose principal point is the middle of its image."""
+    size = stored_size(frame.image, frame.name)
+    return Camera(intrinsics(f, f, (size[0] - 1) / 2, (size[1] - 1) / 2), size, coefficients)
+
+
+def read_nvm(path: Path) -> Layout | None:
+    """VisualSFM's NVM: a line an image, with its focal length, world-to-camera quaternion and centre."""
+    for file in _files(path, "*.nvm"):
+        with file.open(encoding="utf-8", errors="replace") as opened:
+            if opened.readline().startswith("NVM_V3"):
+                return _nvm(file, (line for line in opened if line.strip()))
+    return None
+
+
+def _nvm(file: Path, lines: Iterator[str]) -> Layout:
+    rows = [
+        re.split(r"\t|(?<=\S)\s+(?=(?:[-+.\deE]+\s+){9}[-+.\deE]+\s*$)", next(lines, ""), maxsplit=1)
+        for _ in range(int(next(lines, "0")))
+    ]
+    images = Images([row[0].strip() for row in rows], image_folders(file.parent, file.parent.parent), file)
+
+    def build(frame: CaptureFrame, words: str) -> Candidate:
+        f, qw, qx, qy, qz, *place, k, _ = array_of(words.split(), (10,), "the numbers of an image")
+        turn = Rotation.from_quat([qx, qy, qz, qw]).inv()
+        # VisualSFM straightens by r (1 + k r^2); this is its inverse, as a series.
+        lens = (-k, 3 * k**2, 0.0, 0.0, -12 * k**3)
+        return Candidate(replace(frame, E=pose_of(turn, place)), _central(frame, f, lens))
+
+    pairs = zip(images.names, rows, strict=True)
+    return Layout("VisualSFM", None, [images.candidate(n, partial(build, words=row[-1])) for n, row in pairs])

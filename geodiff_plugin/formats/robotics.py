@@ -1,0 +1,124 @@
+"""Calibrations of robotics: Kalibr, EuRoC, ROS, ORB-SLAM."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.rigs import (
+    Camera,
+    CameraChoice,
+    array_of,
+    intrinsics,
+    make_rig,
+    projected,
+    rigid,
+    transform,
+    two_cameras,
+)
+from geodiff_plugin.formats.storage import read_storage, read_yaml
+from geodiff_plugin.types import Rig
+
+Entries = dict[str, Any]
+ORB_LENSES = {"PinHole": ("k1", "k2", "p1", "p2", "k3"), "KannalaBrandt8": ("k1", "k2", "k3", "k4")}
+#: The right camera's pose in the left one's frame, in settings of version 1.0 and in older ones.
+ORB_POSES = ("Stereo.T_c1_c2", "Tlr")
+#: The baseline of rectified images and their types, by the left camera's name: settings of version 1.0 say
+#: that they are rectified, older ones call them a pinhole's.
+ORB_RECTIFIED = {"Camera1": ("Stereo.b", ("Rectified",)), "Camera": ("Camera.bf", ("Rectified", "PinHole"))}
+
+
+def _pinhole(entries: Entries, coefficients: str) -> Camera:
+    """A camera of Kalibr or EuRoC; ``coefficients`` names the entry with those of its lens."""
+    model = entries["camera_model"]  # of another one the lens is refused
+    model = str(entries["distortion_model"] if model == "pinhole" else model)
+    return Camera(
+        intrinsics(*entries["intrinsics"][-4:]), entries["resolution"], entries[coefficients], model
+    )
+
+
+def read_kalibr(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """Two cameras of a chain, cam0 and cam1 unless chosen; ``T_cn_cnm1`` takes points to a camera."""
+    chain = read_yaml(texts[0])
+    pair = two_cameras(choice, [n for n in range(len(chain)) if f"cam{n}" in chain], (0, 1))
+    from_first = [np.eye(4)]
+    for n in range(1, max(pair) + 1):
+        from_first.append(rigid(chain[f"cam{n}"]["T_cn_cnm1"], f"T_cn_cnm1 of cam{n}") @ from_first[-1])
+    left, right = (_pinhole(chain[f"cam{n}"], "distortion_coeffs") for n in pair)
+    return make_rig(left, right, from_first[pair[0]] @ np.linalg.inv(from_first[pair[1]]))
+
+
+def euroc_camera(sensor: Entries) -> Camera:
+    """The camera of a ``sensor.yaml``."""
+    return _pinhole(sensor, "distortion_coefficients")
+
+
+def read_euroc(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """The images as taken, left file first; ``T_BS`` is a camera's pose in the body's frame, in metres."""
+    sensors = [read_yaml(text) for text in texts]
+    T_body_left, T_body_right = (rigid(sensor["T_BS"]["data"], "T_BS") for sensor in sensors)
+    left, right = map(euroc_camera, sensors)
+    return make_rig(left, right, np.linalg.inv(T_body_left) @ T_body_right)
+
+
+def _projection(info: Entries) -> np.ndarray:
+    """``P`` of a file of ``camera_calibration``, or of the message as ROS 1 or ROS 2 prints it."""
+    matrix = next((info[name] for name in ("projection_matrix", "P", "p") if name in info), None)
+    return array_of(matrix.get("data") if isinstance(matrix, dict) else matrix, (3, 4), "projection_matrix")
+
+
+def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """Files of ``camera_calibration``, or the message as ``echo`` prints it: the rectified images, by ``P``.
+
+    Those that say ``rectified: false`` (``recordings.stereo_calibration``) stand for the images as taken.
+    """
+    infos = [read_yaml(text) for text in texts]
+    sizes = [(i.get("image_width", i.get("width")), i.get("image_height", i.get("height"))) for i in infos]
+    rig = projected(*map(_projection, infos), *sizes)
+    if not rig.E[:3, 3].any():
+        expected = "-fx * baseline in the right camera's file"
+        cure = "These are of single cameras. Calibrate the pair (camera_calibration with two topics)."
+        bad_value("projection_matrix[0, 3]", expected, "the same in both", cure)
+    if all(info.get("rectified", True) for info in infos):
+        return rig
+    left, right = (transform(info["R"], (0, 0, 0), "R") for info in infos)
+    cameras = [
+        Camera(info["K"], size, info["D"], str(info["distortion_model"]))
+        for info, size in zip(infos, sizes, strict=True)
+    ]
+    return make_rig(cameras[0], cameras[1], np.linalg.inv(left) @ rig.E @ right)
+
+
+def _orb_camera(entries: Entries, name: str, kind: str) -> Camera:
+    """The camera of a name; a pinhole may leave coefficients out, which are 0 then."""
+    keys, default = ("fx", "fy", "cx", "cy", *ORB_LENSES.get(kind, ())), 0.0 if kind == "PinHole" else None
+    given = {key: entries.get(f"{name}.{key}".lower(), default if key[0] in "kp" else None) for key in keys}
+    numbers = [array_of(value, (), f"{name}.{key}") for key, value in given.items()]
+    size = [entries.get(f"camera.{side}", [None])[0] for side in ("width", "height")]
+    return Camera(intrinsics(*numbers[:4]), size, numbers[4:], kind)
+
+
+def read_orb_slam(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """The images as taken, by ``Stereo.T_c1_c2`` (or ``Tlr``), else rectified images of one K, in metres."""
+    entries = read_storage(texts[0])
+    kind = entries.get("camera.type", "PinHole")
+    left = "Camera1" if "camera1.fx" in entries else "Camera"
+    pose = next((name for name in ORB_POSES if name.lower() in entries), None)
+    if pose is not None:
+        first, second = (_orb_camera(entries, name, kind) for name in (left, "Camera2"))
+        return make_rig(first, second, rigid(entries[pose.lower()], pose))
+    baseline, types = ORB_RECTIFIED[left]
+    # Of a single camera with a depth sensor, the baseline is made up.
+    depth_sensor = any(key.endswith("depthmapfactor") for key in entries)
+    if depth_sensor or baseline.lower() not in entries or kind not in types:
+        expected = f"of a stereo camera, with {ORB_POSES[0]}, or {baseline} of rectified images"
+        got = f"of a camera of type {kind} {'with a depth sensor' if depth_sensor else 'without them'}"
+        bad_value("the settings", expected, got, "Give the settings that ORB-SLAM runs in stereo with.")
+    camera = _orb_camera(entries, left, "PinHole")
+    if np.any(camera.coefficients):
+        expected = f"zero for rectified images, which have no {ORB_POSES[0]}"
+        bad_value(f"Lens distortion of {left}", expected, "another", "Is it of a single camera?")
+    length = array_of(entries[baseline.lower()], (), baseline)
+    return make_rig(camera, camera, length / (1.0 if left == "Camera1" else camera.K[0, 0]), rectified=True)
