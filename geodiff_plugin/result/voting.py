@@ -19,7 +19,7 @@ from torch import Tensor
 
 from geodiff_plugin.algorithm.correction import highest
 from geodiff_plugin.algorithm.edges import HALF, REACH, STRIP
-from geodiff_plugin.geometry import image_size, is_rectified, resize_image
+from geodiff_plugin.geometry import image_size, is_rectified, resize_image, to_device_of
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.rows import match_rows
 from geodiff_plugin.types import CameraView, PosedViews
@@ -65,6 +65,8 @@ SOFT = 4.0
 MOST_SOFT = 0.14
 #: Votes within about this many pixels of the median make the mean.
 NEAR_PX = 1.0
+#: As ``STRIP``, on a GPU, where a launch costs more than a cache gives: some 200 MB of votes.
+STRIP_ON_GPU = 1 << 16
 #: Side of the last median filter, pixels of the voting grid.
 MEDIAN = 5
 
@@ -142,8 +144,20 @@ def _resized(image_01: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor
 
 def _median_filtered(values: Tensor) -> Tensor:
     """A map ``(H, W)``, each pixel the median of ``MEDIAN`` times ``MEDIAN`` pixels around it."""
-    filtered = cv2.medianBlur(np.ascontiguousarray(values.cpu().numpy()), MEDIAN)
-    return torch.from_numpy(filtered).to(values.device)
+    if values.device.type == "cpu":  # where OpenCV is many times as fast; another device would be waited for
+        return torch.from_numpy(cv2.medianBlur(np.ascontiguousarray(values.numpy()), MEDIAN))
+    return _median_of_windows(values)
+
+
+def _median_of_windows(values: Tensor) -> Tensor:
+    """As OpenCV's ``medianBlur``, which repeats the outermost pixels."""
+    padded = F.pad(values[None, None], (MEDIAN // 2,) * 4, mode="replicate")
+    return F.unfold(padded, MEDIAN)[0].median(0).values.view_as(values)
+
+
+def _rows_at_once(like: Tensor) -> int:
+    """Rows of a map ``(H, W)`` whose windows are worked on at once."""
+    return max(1, (STRIP if like.device.type == "cpu" else STRIP_ON_GPU) // like.shape[-1])
 
 
 def _error_at_edges(error: Tensor, depth_m: Tensor, spacing: float) -> Tensor:
@@ -203,7 +217,8 @@ def _vote_in_windows(voters: Sequence[_Votes], left: Tensor, shift: Tensor, map_
     ]
     closeness = [math.exp(-(v**2 + u**2) / (2.0 * REACH**2)) for v, u in WINDOW]
     out = torch.empty_like(shift)
-    count = max(1, STRIP // width)
+    of_window = to_device_of(shift, torch.tensor(closeness, dtype=shift.dtype, device="cpu"))[:, None, None]
+    count = _rows_at_once(shift)
     for first in range(0, height, count):
         rows = slice(first, min(height, first + count))
         around = [
@@ -211,7 +226,7 @@ def _vote_in_windows(voters: Sequence[_Votes], left: Tensor, shift: Tensor, map_
             for v, u in ((halo + SPACING * v, halo + SPACING * u) for v, u in WINDOW)
         ]
         unlike = torch.stack([colours for *_, colours in around]).sub_(left[:, rows]).abs_().mean(1)
-        alike = unlike.div_(-BRIGHTNESS).exp_() * shift.new_tensor(closeness)[:, None, None]
+        alike = unlike.div_(-BRIGHTNESS).exp_() * of_window
         votes, weights = [shift[rows][None]], [(map_vote * sum(closeness)).expand_as(shift[rows])[None]]
         for k in range(len(voters)):
             votes.append(torch.cat([each[2 * k] for each in around]))
@@ -233,7 +248,7 @@ def _enlarged(voted: Tensor, left: Tensor, whole: Tensor) -> Tensor:
     (height, width), (rows, columns) = image_size(whole), image_size(left)
     out = voted.new_empty(height, width)
     x = (torch.arange(width, device=voted.device, dtype=voted.dtype) + 0.5) * (columns / width) - 0.5
-    count = max(1, STRIP // width)
+    count = _rows_at_once(out)
     for first in range(0, height, count):
         part = slice(first, min(height, first + count))
         y = torch.arange(part.start, part.stop, device=voted.device, dtype=voted.dtype) + 0.5

@@ -325,3 +325,8 @@ def test_a_good_map_keeps_its_edges_only_if_they_are_crisp():
         blurred = F.avg_pool2d(F.pad(truth.log(), (pixels // 2,) * 4, mode="replicate"), pixels, 1).exp()
         share = float(voting._crispness(blurred[0, 0]))
         assert share == pytest.approx(min(1.0, 2.5 / pixels), rel=0.05)
+
+
+def test_median_filter_is_opencvs_on_any_device() -> None:
+    values = torch.rand(17, 23)
+    assert torch.equal(voting._median_of_windows(values), voting._median_filtered(values))
