@@ -1,5 +1,6 @@
 """What the documentation shows runs, and what it names exists."""
 
+import inspect
 import pkgutil
 import re
 import tomllib
@@ -9,6 +10,7 @@ import pytest
 
 import geodiff_plugin
 from geodiff_plugin.messages import MESSAGES
+from tests.parity.algorithm1_oracle import algorithm_1
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -82,6 +84,11 @@ def test_parts_that_pages_name_exist(name):
     except AttributeError:  # a field without a default
         record, field = f"geodiff_plugin.{name}".rsplit(".", 1)
         assert field in pkgutil.resolve_name(record).__dataclass_fields__
+
+
+def test_the_page_of_algorithm_1_shows_the_oracle():
+    page = (ROOT / "docs" / "explanation" / "algorithm-1.md").read_text(encoding="utf-8")
+    assert f"```python\n{inspect.getsource(algorithm_1)}```" in page
 
 
 def test_constraints_pin_every_dependency():

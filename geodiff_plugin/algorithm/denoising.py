@@ -1,7 +1,9 @@
 """The arithmetic between a network's output, the clean latent and the noise, for every prediction type.
 
 Eq. 6 (eq:tweedie) of Algorithm 1 divides by sqrt(alpha_bar), which is 0 at the first step of a
-zero-terminal-SNR schedule, and its sign fits a score, not noise. These are the formulas of the schedulers.
+zero-terminal-SNR schedule, and its sign fits a score, not noise. These are the formulas of the schedulers of
+diffusers, repeated: their ``step`` gives the clean latent only afterwards, some give none, and guidance needs
+its gradient. tests/parity/test_scheduler_parity.py compares them with every ``step``.
 """
 
 from __future__ import annotations
