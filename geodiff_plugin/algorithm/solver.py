@@ -14,8 +14,10 @@ from torch import Tensor
 
 from geodiff_plugin._kernels import use_kernel
 
-#: The shorter side, in pixels, of the coarsest grid, and its conjugate-gradient steps: near enough to exact.
-COARSEST_SIDE, COARSEST_STEPS = 24, 80
+#: The shorter side, in pixels, of the coarsest grid.
+COARSEST_SIDE = 24
+#: Its conjugate-gradient steps: near enough to exact.
+COARSEST_STEPS = 80
 
 
 @dataclass(frozen=True)

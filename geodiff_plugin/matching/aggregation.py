@@ -16,8 +16,10 @@ from geodiff_plugin.matching.winner import NEVER
 
 #: Cost of a step of one plane between neighbouring pixels, in units of the largest matching cost.
 STEP_PENALTY = 0.15
-#: Cost of any larger step where the image is flat; difference in brightness that halves this cost.
-JUMP_PENALTY, JUMP_CONTRAST = 1.2, 0.1
+#: Cost of any larger step where the image is flat.
+JUMP_PENALTY = 1.2
+#: Difference in brightness that halves this cost: depth steps where the image does.
+JUMP_CONTRAST = 0.1
 #: Steps (rows, columns) along which paths run both ways: down and up, right and left.
 AXES = ((1, 0), (0, 1))
 PATHS = 2 * len(AXES)

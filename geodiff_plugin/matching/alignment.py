@@ -19,8 +19,10 @@ _AS_IT_IS_PX = 0.02
 # Planes that come nearer to the right camera's plane than this share of their depth are not seen.
 _LEAST_RATIO = 0.02
 # Where many planes are plain shifts along the rows, the census of the right image is computed once at this
-# many positions per pixel, along the row and across.
-_PHASES, _ROW_PHASES = 8, 4
+# many positions per pixel along the row.
+_PHASES = 8
+# The same across the rows.
+_ROW_PHASES = 4
 # Plain shifts may drift across the rows by this much: calibrated baselines lie a little out of the row.
 _MOST_DRIFT_PX = 1.0
 # Given wherever a tensor is made: otherwise the user's default device and dtype would apply.

@@ -22,23 +22,31 @@ from geodiff_plugin.types import CameraView
 _FEWEST_PLANES = 24
 #: How far the median pixel moves from one plane to the next, px: below a pixel, for positions between planes.
 PLANE_STEP_PX = 0.75
-# The coarse sweep that finds how near the planes must reach: pixels, planes.
-PILOT_PIXELS, PILOT_PLANES = 20_000, 160
+# Pixels of the coarse sweep that finds how near the planes must reach.
+PILOT_PIXELS = 20_000
+# Upper bound on its planes.
+PILOT_PLANES = 160
 # The shift of the median pixel from one of its planes to the next, px.
 PILOT_STEP_PX = 1.0
-# The coarse sweep reaches to the depth that shifts by the first number, in image widths, in the view that
-# moves least: a near surface leaves the view that moves most while others still show it. It reaches at most
-# the second number times nearer than that depth for the view that moves most.
-PILOT_SHIFT, MOST_NEARER = 0.4, 3.0
-# Matches of the coarse sweep above this confidence; the quantile of their inverse depth taken as nearest.
-PILOT_CONFIDENCE, PILOT_QUANTILE = 0.8, 0.995
+# The coarse sweep reaches to the depth that shifts by this, in image widths, in the view that moves least: a
+# near surface leaves the view that moves most while others still show it.
+PILOT_SHIFT = 0.4
+# It reaches at most this many times nearer than that depth for the view that moves most.
+MOST_NEARER = 3.0
+# Matches of the coarse sweep count above this confidence.
+PILOT_CONFIDENCE = 0.8
+# The quantile of their inverse depth that is taken as nearest: a few matches are wrong.
+PILOT_QUANTILE = 0.995
 # If fewer pixels than this share have such a match, the planes reach as near as the coarse sweep did.
 PILOT_LEAST_SHARE = 0.03
-# The planes reach this factor nearer than the nearest match, and at least to this shift, in image widths.
-HEADROOM, LEAST_SHIFT = 1.25, 0.03
-# The inverse pose is preferred if it matches this many times as much of the image as the given one; number
-# of pixels of the sweeps that compare them.
-_CLEARLY, _INVERSE_PIXELS = 1.25, 15_000
+# The planes reach this factor nearer than the nearest match.
+HEADROOM = 1.25
+# They reach to this shift at least, in image widths.
+LEAST_SHIFT = 0.03
+# The inverse pose is preferred if it matches this many times as much of the image as the given one.
+_CLEARLY = 1.25
+# Pixels of the sweeps that compare the two poses.
+_INVERSE_PIXELS = 15_000
 # If the given pose matches this share of the image, the inverse pose is not tried.
 _ENOUGH_MATCHED = 0.4
 

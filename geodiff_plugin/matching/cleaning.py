@@ -25,24 +25,34 @@ _LUMA_STEPS = (
     *(49, 64, 78, 87, 103, 121, 120, 101),
     *(72, 92, 95, 98, 112, 100, 103, 99),
 )
-# Coefficients that even strong compression keeps; how many must agree on the scale of the table, and to what.
+# Coefficients that even strong compression keeps.
 _KEPT = ((0, 1), (1, 0), (2, 0), (1, 1), (0, 2), (0, 3), (1, 2), (2, 1), (3, 0))
-_LEAST_VOTES, _ALIKE = 5, 0.3
-# Upper bounds on the quantisation steps that are tried and on the blocks that are read.
-_MOST_STEP, _MOST_BLOCKS = 100, 2048
-# A step counts if at least so many values are multiples of it, and so closely (mean cosine).
-_LEAST_VALUES, _LEAST_FIT = 32, 0.5
+# How many of them must agree on the scale of the table.
+_LEAST_VOTES = 5
+# How nearly they must agree.
+_ALIKE = 0.3
+# Upper bound on the quantisation steps that are tried.
+_MOST_STEP = 100
+# Upper bound on the blocks that are read, which bounds the time.
+_MOST_BLOCKS = 2048
+# A step counts if at least so many values are multiples of it.
+_LEAST_VALUES = 32
+# How closely they must be multiples of it (mean cosine).
+_LEAST_FIT = 0.5
 # A step of more grey levels than this between two pixels is the scene's, not the edge of a block.
 _MOST_BLOCK_EDGE = 8.0
-# Noise is read from the finest coefficients of the flattest tenth of the blocks, which contain less of it
-# than the others: the factor is that of normally distributed noise.
-_FLATTEST, _NOISE_OF_FLATTEST = 0.1, 1.0 / 0.77
+# Noise is read from the finest coefficients of the flattest blocks, of which this is the share.
+_FLATTEST = 0.1
+# These contain less of it than the others: the factor is that of normally distributed noise.
+_NOISE_OF_FLATTEST = 1.0 / 0.77
 # Noise below the first number of grey levels does not disturb the matching and may be fine texture; noise
 # above the second is removed in full.
 _NOISE_RANGE = (1.7, 2.8)
-# Coefficients below the first number of steps, or the second of noise deviations, are removed.
-# On rendered pairs wrong matches are equally few from half to twice these numbers.
-_STEPS, _DEVIATIONS = 1.2, 3.6
+# Coefficients below this number of steps are removed. On rendered pairs wrong matches are equally few from
+# half to twice this number.
+_STEPS = 1.2
+# So are those below this number of noise deviations; the same holds of it.
+_DEVIATIONS = 3.6
 # 16 of the 64 positions of the blocks, every row and column twice.
 _SHIFTS = tuple((i, (3 * i + k) % _BLOCK) for i in range(_BLOCK) for k in (0, _BLOCK // 2))
 # A picture with more than so many times the pixels of the matching grid is cleaned enough by shrinking;

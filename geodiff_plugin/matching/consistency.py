@@ -22,8 +22,10 @@ LOG_ODDS = (5.8, 0.8, -5.9, -0.62)
 #: Difference in planes up to which matches of the two views agree.
 AGREEMENT_PLANES = 1.5
 #: For full confidence a match's cost, averaged over a window of this half width in px, lies below the mean
-#: plane's by this share of the largest cost. Else aggregation would carry matches across blank walls.
-CONTRAST_REACH, LEAST_CONTRAST = 15, 0.03
+#: plane's by ``LEAST_CONTRAST``. Else aggregation would carry matches across blank walls.
+CONTRAST_REACH = 15
+#: The least such difference, as a share of the largest cost.
+LEAST_CONTRAST = 0.03
 # Only every second row of the right view is matched.
 _EVERY_ROW = 2
 

@@ -18,16 +18,22 @@ UNIT = 0.01
 #: Reflections. Half the side of the window over which matches must agree, in image sides; with a smaller one,
 #: gaps that the prior misses would be taken for reflections.
 REGION = 0.08
-#: How far behind the prior a reflection lies: in spreads of the matches around the prior's log depth, and at
-#: least, in log depth. A prior that misses a whole wall would have it rejected at fewer spreads.
-SPREADS, LEAST_DISTANCE = 3.0, 0.2
+#: How far behind the prior a reflection lies, in spreads of the matches around the prior's log depth. A prior
+#: that misses a whole wall would have it rejected at fewer spreads.
+SPREADS = 3.0
+#: How far it lies behind at least, in log depth.
+LEAST_DISTANCE = 0.2
 #: A match's weight falls to 0 between that distance and this multiple of it.
 MULTIPLE = 1.6
-#: Matches above this confidence make the spread; least spread, in log depth.
-SPREAD_CONFIDENCE, SPREAD_FLOOR = 0.3, 0.05
-#: The spread is this quantile of the distances over the normal distribution's: the median would miss that
-#: nearly half of the scene is on a wrong surface.
-SPREAD_SHARE, NORMAL_QUANTILE = 0.6, 0.8416
+#: Matches above this confidence make the spread.
+SPREAD_CONFIDENCE = 0.3
+#: Least spread, in log depth.
+SPREAD_FLOOR = 0.05
+#: The spread is measured at this quantile of the distances: the median would miss that nearly half of the
+#: scene is on a wrong surface.
+SPREAD_SHARE = 0.6
+#: The same quantile of the size of a normal variable, by which it is divided.
+NORMAL_QUANTILE = 0.8416
 #: About so many distances are sorted: torch's quantile takes no more than 16 million.
 MOST_SORTED = 1 << 22
 #: Larger differences in log depth count as this one.

@@ -20,8 +20,10 @@ PARAMETERS = {
     "speckleRange": 2,
     "disp12MaxDiff": 1,
 }
-#: Shifts below so many pixels are too small to measure depth; none exceeds this share of the image's width.
-MIN_SHIFT_PX, MAX_SHIFT = 0.3, 0.3
+#: Shifts below so many pixels are too small to measure depth.
+MIN_SHIFT_PX = 0.3
+#: No shift exceeds this share of the image's width, which bounds the time of the search.
+MAX_SHIFT = 0.3
 
 
 def make_matcher(lowest: int, count: int, channels: int) -> Any:

@@ -22,27 +22,38 @@ from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.reconstruction import FEWEST_FOR_FOCAL, Match, Reconstruction, pycolmap
 
-#: Frames that a frame is matched with: so many after it, and so many others that look at the same place.
-AFTER, ELSEWHERE, MOST_TURN_DEG = 6, 5, 50.0
-#: Fewer observations than this connect no frame; frames with this share of the usual features are blurred.
-FEWEST_OBSERVATIONS, BLURRED_SHARE = 25, 0.15
+#: A frame is matched with so many frames after it.
+AFTER = 6
+#: It is also matched with so many others that look at the same place.
+ELSEWHERE = 5
+#: These are turned by this much against it at most, degrees.
+MOST_TURN_DEG = 50.0
+#: Fewer observations than this connect no frame.
+FEWEST_OBSERVATIONS = 25
+#: Frames with less than this share of the usual features are blurred.
+BLURRED_SHARE = 0.15
 #: Rounds of triangulation and adjustment: most reprojection error, scale of the Cauchy loss, both pixels.
 ROUNDS = ((20.0, 4.0), (8.0, 2.0), (3.0, 1.0))
 #: The furthest that the focal length may move, as a share of itself.
 MOST_FOCAL = 0.15
 #: A solve must leave less than this share of the residual of the given poses, or they are kept.
 LEAST_GAIN = 0.9
-#: Matches of a pair that its residual is taken from, and fewest of a frame that say which poses fit it.
-MOST_PER_PAIR, FEWEST_PER_FRAME = 100, 50
-#: A scale is never known better than this: both measures share errors that no spread over frames shows.
-SCALE_FLOOR_TRAJECTORY, SCALE_FLOOR_DEPTH = 0.02, 0.015
+#: Matches of a pair that its residual is taken from, at most.
+MOST_PER_PAIR = 100
+#: Fewest matches of a frame that say which poses fit it.
+FEWEST_PER_FRAME = 50
+#: A scale from the trajectory is never known better than this: frames share errors that no spread shows.
+SCALE_FLOOR_TRAJECTORY = 0.02
+#: The same of a scale from the depth of the scene.
+SCALE_FLOOR_DEPTH = 0.015
 #: Both scales are called in disagreement beyond this.
 DISAGREES = 0.1
 #: Another convention of the given poses is taken where it leaves this share of their misfit at most.
 CONVENTION_GAIN = 0.5
-#: A given position is reported as wrong if the solve moves it this many times as far as the median one, and
-#: by this share of the size of the trajectory.
-FAR_TIMES, FAR_SHARE = 10.0, 0.1
+#: A given position is reported as wrong if the solve moves it this many times as far as the median one.
+FAR_TIMES = 10.0
+#: It also moves it by this share of the size of the trajectory, so that exact poses are not reported.
+FAR_SHARE = 0.1
 #: Names that a sentence gives.
 MOST_NAMES = 5
 #: Where one frame sees points of the solve, ``(n, 2)`` pixels, and the rows ``(n,)`` of these points.

@@ -28,18 +28,26 @@ from geodiff_plugin.pose.tracks import (
 
 #: An inlier lies nearer than this to its epipolar line, or to its position under a simpler motion.
 INLIER_PX = 2.0
-#: Fewer inliers, or a smaller share of the matches, make no pose.
-FEWEST_INLIERS, LEAST_SHARE = 30, 0.3
-#: Median angle between the two rays of a point below which depth is refused, and is inaccurate.
-NO_PARALLAX_DEG, LITTLE_PARALLAX_DEG = 0.3, 0.6
+#: Fewer inliers make no pose.
+FEWEST_INLIERS = 30
+#: A smaller share of inliers among the matches makes none.
+LEAST_SHARE = 0.3
+#: Median angle between the two rays of a point below which depth is refused.
+NO_PARALLAX_DEG = 0.3
+#: The angle below which it is inaccurate.
+LITTLE_PARALLAX_DEG = 0.6
 #: A pair is rectified if its rows agree this well without any rotation.
 RECTIFIED_PX = 0.45
 #: A simpler motion that explains this share of the inliers is preferred.
 SIMPLER = 0.9
-#: Matches this far from their lines are not explained by noise. A second motion that explains this share of
-#: all matches, and this share of those, is one of the scene. Above the last number, as a share of the first
-#: motion's matches, either motion may be the camera's.
-APART_PX, SECOND_SHARE, SECOND_OF_REST, RIVAL = 6.0, 0.1, 0.5, 0.45
+#: Matches this far from their lines are not explained by noise.
+APART_PX = 6.0
+#: A second motion that explains this share of all matches may be one of the scene.
+SECOND_SHARE = 0.1
+#: It is one if it also explains this share of the matches that the first motion leaves.
+SECOND_OF_REST = 0.5
+#: Above this share of the first motion's matches, either motion may be the camera's.
+RIVAL = 0.45
 # Robust scales of the last fits, pixels: only matches determine an estimated pose.
 _NARROWER_PX = (0.3, 0.15, 0.08)
 # The depth of a pixel is that of the matches this near, pixels of their grid.

@@ -44,14 +44,21 @@ _FACTORS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 2, 2.0, 3.0, 4.0)
 # coarsely, because a mistaken pose may be inexact as well, and finely, because with a short baseline even a
 # wrong K or pose leaves most matches within a few pixels of their lines.
 _NEAR_PX = (4.0, 1.5)
-# A mistake must explain more matches than the given pose by this factor, this share of all matches, and this
-# share of those that the nearby pose explains.
-_CLEARLY, _AT_LEAST, _NEARLY = 2.0, 0.5, 0.85
+# A mistake must explain more matches than the given pose by this factor.
+_CLEARLY = 2.0
+# It must explain this share of all matches.
+_AT_LEAST = 0.5
+# It must explain this share of those that the nearby pose explains.
+_NEARLY = 0.85
 # An inexact pose may look like a mistake: another K or other axes can bring it near the matches, but not onto
 # them. So either the median residual must be within this factor of the nearby pose's, or the candidate must
-# lie this far from the given pose, in degrees or shares of the baseline, or have another K. If only the fine
-# shares distinguish it from the given pose, both must hold.
-_AS_EXACT, _FAR_DEG, _FAR_SHIFT = 1.2, 5.0, 0.8
+# lie far from the given pose, or have another K. If only the fine shares distinguish it from the given pose,
+# both must hold.
+_AS_EXACT = 1.2
+# How far from the given pose counts as far, degrees.
+_FAR_DEG = 5.0
+# The same in shares of the baseline.
+_FAR_SHIFT = 0.8
 # Among candidates whose share is this near the largest, a finer measure decides.
 _ALIKE = 0.95
 #: A longer baseline, with a scene as far away, may be in centimetres or millimetres.

@@ -14,8 +14,12 @@ import numpy as np
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.pose.tracks import sift_features
 
-#: Longer side of the images that features are sought in, pixels; most of an image; their least contrast.
-LONG_SIDE, MOST_FEATURES, CONTRAST = 800, 2000, 0.02
+#: Longer side of the images that features are sought in, pixels.
+LONG_SIDE = 800
+#: Most features of an image, which bounds the time of matching.
+MOST_FEATURES = 2000
+#: Their least contrast.
+CONTRAST = 0.02
 #: Fewer inliers than this are no match of two frames.
 FEWEST_INLIERS = 20
 #: Standard deviation of given positions, as a share of the frames' spread; a tracker drifts by some per cent.

@@ -32,22 +32,36 @@ from geodiff_plugin.pose.tracks import (
 )
 from geodiff_plugin.types import CameraView, PoseReport
 
-#: Largest median distance of matches from their epipolar lines at which a pose fits: for rectified rigs,
-#: whose lenses alone err this much; for others, where a shift hides most of a wrong rotation.
-FITS_PX, POSED_FITS_PX = 0.45, 0.3
+#: Largest median distance of matches from their epipolar lines at which the pose of a rectified rig fits: its
+#: lenses alone err this much.
+FITS_PX = 0.45
+#: The same of any other pose, where a shift hides most of a wrong rotation.
+POSED_FITS_PX = 0.3
 #: The user is warned if the given pose has a larger residual than this.
 WARNS_PX = 1.0
-# A refinement must remove this share of the residual, and may turn and shift a camera by this much at most.
-_LEAST_GAIN, _MOST_TURN_DEG, _MOST_SHIFT = 0.1, 8.0, 0.8
-#: Relative standard deviation, under the poses of a tracker, of the distance between two cameras and of the
-#: scene's median depth; measured on 85 pairs of two trackers.
-LENGTH_SPREAD, DEPTH_SPREAD = 0.15, 0.05
+# A refinement must remove this share of the residual.
+_LEAST_GAIN = 0.1
+# It may turn a camera by this much at most, degrees.
+_MOST_TURN_DEG = 8.0
+# It may shift a camera by this share of the baseline at most.
+_MOST_SHIFT = 0.8
+#: Relative standard deviation, under the poses of a tracker, of the distance between two cameras; measured on
+#: 85 pairs of two trackers.
+LENGTH_SPREAD = 0.15
+#: The same of the scene's median depth, measured on the same pairs.
+DEPTH_SPREAD = 0.05
 # The user is warned if the pose that fits best changes log depth by more than this, in the median.
 _MOST_SPREAD = 0.13
-# Straightening: residual above which a match counts for less, pixels; pull of the 20 coefficients towards 0,
-# in matches; fewest matches; side of the blocks for cross-validation, as a share of the image's longer side;
-# share by which the residual of left-out matches must fall.
-_BENT_PX, _RIDGE, _FEWEST_BENT, _BLOCK, _LEAST_BENT_GAIN = 0.5, 3.0, 80, 1.0 / 6.0, 0.05
+# Straightening: residual above which a match counts for less, pixels.
+_BENT_PX = 0.5
+# Pull of its 20 coefficients towards 0, in matches.
+_RIDGE = 3.0
+# Fewest matches that it is fitted to.
+_FEWEST_BENT = 80
+# Side of the blocks for cross-validation, as a share of the image's longer side.
+_BLOCK = 1.0 / 6.0
+# Share by which the residual of left-out matches must fall.
+_LEAST_BENT_GAIN = 0.05
 
 _CAUSES = (
     "Likely causes: poses of a tracker, of SLAM or of a rig that has drifted; things that moved between the "

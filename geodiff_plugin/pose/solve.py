@@ -35,17 +35,28 @@ FREE_PX = 1e3
 MOST_SPREAD = 0.06
 _STEPS = 12
 # A refined pose may move points, also along their lines, by this share of the residual that it explains:
-# (explained residual / (_FAULTS * faults))^4, within the bounds _MOVED_SHARE. Faults are errors of the
-# cameras (rolling shutter, lenses, K), which the residuals of neighbours have in common. Below, a free pose
-# would hide the faults; above, the given pose was wrong.
-_FAULTS, _MOVED_SHARE = 5.6, (0.2, 40.0)
-_FLOOR_PX, _LEAST_FAULT_PX = 0.05, 0.03
-# A rectified pair has another share and a narrower prior: its cameras are bolted together, turn by tenths
-# of a degree and hardly shift, and a pan that fits the rows better is more often an error of the lenses.
-_RIG_MOVED_SHARE, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE = 0.4, np.radians(0.3), 0.01
-# Robust scale after the first fit, as a factor on its residual and at least in pixels; weight of residuals,
-# a half, because blocks of the image do not show all that neighbours have in common.
-_SCALE_BY, _LEAST_SCALE_PX, _COUNTS = 2.0, 0.1, 0.5
+# (explained residual / (_FAULTS * faults))^4. Faults are errors of the cameras (rolling shutter, lenses, K),
+# which the residuals of neighbours have in common.
+_FAULTS = 5.6
+# Bounds of that share: below, a free pose would hide the faults; above, the given pose was wrong.
+_MOVED_SHARE = (0.2, 40.0)
+# Least residual that counts, and least distance by which such a pose may move points, pixels.
+_FLOOR_PX = 0.05
+# Least size of the faults, pixels: no camera has none.
+_LEAST_FAULT_PX = 0.03
+# A rectified pair has another share and a narrower prior, because its cameras are bolted together; a pan that
+# fits the rows better is more often an error of the lenses.
+_RIG_MOVED_SHARE = 0.4
+# They turn by tenths of a degree.
+_RIG_TURNED_RAD = np.radians(0.3)
+# They hardly shift, in baselines.
+_RIG_SHIFTED_SHARE = 0.01
+# Robust scale after the first fit, as a factor on its residual.
+_SCALE_BY = 2.0
+# The least such scale, pixels.
+_LEAST_SCALE_PX = 0.1
+# Weight of residuals: a half, because blocks of the image do not show all that neighbours have in common.
+_COUNTS = 0.5
 # If the given pose was wrong, only the matches determine the new one, and narrower fits follow: what most
 # matches agree on is nearer to the truth than the best compromise between all.
 _NARROWER_BY = (1.0, 0.5)

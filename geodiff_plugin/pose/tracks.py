@@ -23,12 +23,20 @@ from geodiff_plugin.types import CameraView
 
 #: Longer side of the left image that matches are sought on, pixels; residuals are in pixels of this grid.
 LONG_SIDE = 832
-# SIFT: ratio test of nearest and second nearest descriptor (Lowe 2004); upper bound on the points, which
-# bounds the time of matching; contrast threshold, low, so that blank walls give some points as well.
-_RATIO, _MOST_POINTS, _CONTRAST = 0.8, 4000, 0.01
-# Flow: side of a cell, which gives one match, pixels; least standard deviation of its grey, of 255; bound on
-# the forward-backward difference, pixels; bound on the flow, which only corrects a warp.
-_CELL_PX, _LEAST_CONTRAST, _THERE_AND_BACK_PX, _FARTHEST_PX = 10, 2.0, 0.5, 24.0
+# SIFT: ratio test of nearest and second nearest descriptor (Lowe 2004).
+_RATIO = 0.8
+# SIFT: upper bound on the points, which bounds the time of matching.
+_MOST_POINTS = 4000
+# SIFT: contrast threshold, low, so that blank walls give some points as well.
+_CONTRAST = 0.01
+# Flow: side of a cell, which gives one match, pixels.
+_CELL_PX = 10
+# Flow: least standard deviation of the grey of a cell, of 255.
+_LEAST_CONTRAST = 2.0
+# Flow: bound on the forward-backward difference, pixels.
+_THERE_AND_BACK_PX = 0.5
+# Flow: bound on the flow, which only corrects a warp, pixels.
+_FARTHEST_PX = 24.0
 # Windows that spread matches into holes, pixels of the coarse sweep; each has a hundredth of the last weight.
 _WINDOWS = (3, 7, 15, 31, 63)
 # Least inverse depth, as a share of the largest.
@@ -36,7 +44,11 @@ _FARTHEST = 1e-3
 #: With fewer matches than this a pose is not checked.
 FEWEST = 40
 #: Blocks a row of the left image, for what neighbouring residuals have in common.
-_BLOCKS, _FEWEST_IN_BLOCK, _FEWEST_BLOCKS = 10, 5, 3
+_BLOCKS = 10
+#: Fewest residuals of a block that say so.
+_FEWEST_IN_BLOCK = 5
+#: Fewest blocks.
+_FEWEST_BLOCKS = 3
 _TINY = 1e-12
 #: A grey image ``(H, W)`` uint8 and its K ``(3, 3)`` float64.
 GreyImage = tuple[np.ndarray, np.ndarray]

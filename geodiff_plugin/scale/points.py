@@ -17,30 +17,45 @@ from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.matches import UNIT
 from geodiff_plugin.scale.space import SPACES, MetricMap, Space
 
-#: Matches above this confidence are reliable; fewer than the second number are not used.
-RELIABLE, FEWEST_RELIABLE = 0.5, 50
-#: Candidates of near, and of far, in the search by points or reliable matches; upper bound on these points.
-BASIN_CANDIDATES, BASIN_SAMPLES = 48, 1500
+#: Matches above this confidence are reliable: more likely right than wrong.
+RELIABLE = 0.5
+#: Fewer reliable matches than this are not used: they may all lie on one wrong surface.
+FEWEST_RELIABLE = 50
+#: Candidates of near, and of far, in the search by points or reliable matches: 1128 pairs.
+BASIN_CANDIDATES = 48
+#: Upper bound on the points of that search, which bounds its time.
+BASIN_SAMPLES = 1500
 #: Factor by which the candidates reach beyond the range of the points.
 BASIN_REACH = 4.0
-#: Width of the Cauchy cost in units of the points, about the error of a prior; the current state stays if
-#: its cost is within this factor of the best.
-BASIN_CAUCHY, BASIN_KEEP = 32.0, 1.05
-#: Reweighted Gauss-Newton steps on near and far; upper bound on the matches of the fit.
-FIT_ITERATIONS, FIT_SAMPLES = 12, 8000
+#: Width of the Cauchy cost in units of the points, about the error of a prior.
+BASIN_CAUCHY = 32.0
+#: The current state stays if its cost is within this factor of the best: a new one restarts scale and shift.
+BASIN_KEEP = 1.05
+#: Reweighted Gauss-Newton steps on near and far: a fixed number, so that no GPU is waited for.
+FIT_ITERATIONS = 12
+#: Upper bound on the matches of the fit, which bounds its time.
+FIT_SAMPLES = 8000
 #: Upper bound on the values that are sorted for a quantile.
 MOST_SORTED = 20_000
-#: Standard deviation of a match of confidence .96, planes; least one of the map's residuals, log depth.
-FIT_NOISE, FIT_FLOOR = 0.5, 4e-3
+#: Standard deviation of a match of confidence .96, planes.
+FIT_NOISE = 0.5
+#: Least standard deviation of the map's residuals, log depth.
+FIT_FLOOR = 4e-3
 #: Width of the Cauchy weight, in standard deviations of match and map together.
 FIT_CAUCHY = 2.0
-#: Bounds of the change of near and of far in the fit, as log factors.
-NEAR_REACH, FAR_REACH = 1.4, 0.7
-#: Upper and lower bound on the reliable matches whose depth order is compared with the prior's.
-ORDER_SAMPLES, ORDER_FEWEST = 4000, 40
+#: Bound of the change of near in the fit, as a log factor: the fit must stay in its basin.
+NEAR_REACH = 1.4
+#: The same of far.
+FAR_REACH = 0.7
+#: Upper bound on the reliable matches whose depth order is compared with the prior's.
+ORDER_SAMPLES = 4000
+#: Lower bound on them: the rank correlation of fewer is chance.
+ORDER_FEWEST = 40
 # The variance of a match is proportional to its doubt, ``1 - confidence``: so it was on pairs with truth.
-# ``FIT_NOISE`` holds at the first doubt; lower doubts count as this share of it at least.
-_REFERENCE_DOUBT, _LEAST_DOUBT = 0.04, 0.16
+# ``FIT_NOISE`` holds at this doubt.
+_REFERENCE_DOUBT = 0.04
+# Lower doubts count as this share of it at least.
+_LEAST_DOUBT = 0.16
 
 
 def depth_span(points: Matches) -> tuple[Tensor, Tensor]:
@@ -144,6 +159,12 @@ def _refine_once(
     form: Space, ends: Tensor, values: Tensor, matched: Tensor, noise: Tensor, bounds: tuple[Tensor, Tensor]
 ) -> Tensor:
     """One reweighted Gauss-Newton step on ``ends (B, 2)``, kept within ``bounds``.
+
+    With ``q_i`` the inverse depth of a match, ``n`` its noise, ``m_i(e)`` that of the map at the ends ``e``,
+    and ``r_i(e) = log((q_i + n) / (m_i(e) + n))``, the steps minimise ``sum_i c_i C^2 log(1 + r_i^2 / (C^2
+    v_i))``, ``C = FIT_CAUCHY``, by ``e -= (J' W J)^-1 J' W r`` with ``W = diag(c_i / (v_i (1 + r_i^2 / (C^2
+    v_i))))``. The variance ``v_i`` is that of the match at the map's depth plus that of the map, the weighted
+    median of ``|r|``; both are measured anew in every step.
 
     ``matched (3, P)`` are the inverse depth >= 0 of matches, their confidence, and their standard deviation
     in units of ``noise``, ``()`` 1/m, that of a match of the reference confidence.
