@@ -99,7 +99,7 @@ def constant_like(like: Tensor, *values: float) -> Tensor:
 
 
 def to_device_of(like: Tensor, matrix: Tensor) -> Tensor:
-    """A camera matrix on the device of ``like``, in its own dtype.
+    """A camera matrix, or positions made of cameras, on the device of ``like``, in its own dtype.
 
     Cameras stay on the CPU, where decisions about them are taken, until they meet pixels. The host does not
     wait: a copy of so few bytes from its memory is staged at once.
@@ -170,6 +170,21 @@ def rays_of(like: Tensor, K_left: Tensor, K_right: Tensor, T_right_from_left: Te
     """``plane_rays`` for the grid of a map or an image ``like (B, C, H, W)``, on its device."""
     K_left, K_right, T = (to_device_of(like, each) for each in (K_left, K_right, T_right_from_left))
     return plane_rays(K_left, K_right, T, image_size(like))
+
+
+def sampled_rays(
+    K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor, size: tuple[int, int]
+) -> PlaneRays:
+    """``plane_rays`` of 1024 to 2047 pixels of a grid ``(H, W)``, or of all if it has fewer, one camera each.
+
+    ``K (3, 3)``, ``T (4, 4)``. They are enough for medians over the grid.
+    """
+    pixels = size[0] * size[1]
+    at = torch.arange(0, pixels, max(1, pixels // 1024), device=K_left.device)
+    y = ((at // size[1]).to(K_left) - K_left[1, 2]) / K_left[1, 1]
+    x = ((at % size[1]).to(K_left) - K_left[0, 2]) / K_left[0, 0] - K_left[0, 1] / K_left[0, 0] * y
+    M = K_right @ T_right_from_left[:3, :3]
+    return (M[:, 2:] + M[:, 1:2] * y + M[:, :1] * x)[None], (K_right @ T_right_from_left[:3, 3:])[None]
 
 
 def project_rays(depth_m: Tensor, rays: PlaneRays) -> tuple[Tensor, Tensor]:

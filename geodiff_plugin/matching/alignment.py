@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from geodiff_plugin.geometry import EDGE_PX, image_size, sample_at
+from geodiff_plugin.geometry import EDGE_PX, constant_like, image_size, sample_at, to_device_of
 from geodiff_plugin.matching.census import MARGIN_PX, census, census_cost, grey_levels
 
 # A view that turning would move by less than this stays as it is.
@@ -52,25 +52,30 @@ class AlignedView:
     def positions(self, count: int, axis: int, margin: int = 0) -> Tensor:
         """Where the left grid's ``count`` columns (``axis`` 0) or rows (1) lie, ``(D, count + 2 * margin)``.
 
-        Canvas pixels, float32, not clipped; the lines beyond the grid on either side repeat its outermost.
+        Canvas pixels, float32 on the CPU, not clipped; the lines beyond the grid repeat its outermost.
         """
         lines = torch.arange(-margin, count + margin, **_CPU_FLOAT64).clamp_(0, count - 1)
-        at = self.scale[:, None] * lines + self.shift[:, axis, None]
-        return at.to(self.grey.device, torch.float32)
+        return (self.scale[:, None] * lines + self.shift[:, axis, None]).float()
 
     def sources(self, count: int, axis: int) -> Tensor:
-        """The inverse of ``positions``: the left line of each canvas line, ``(D, n)``; ``count`` for none."""
+        """The inverse of ``positions``: the left line of each canvas line, ``(D, n)``; ``count`` for none.
+
+        They are int64 on the CPU.
+        """
         lines = torch.arange(self.size[1 - axis], **_CPU_FLOAT64)
         scale = self.scale[:, None]
         at = ((lines - self.shift[:, axis, None]) / scale.clamp_min(1e-9)).round()
         seen = (scale > 0) & (at >= 0) & (at < count)
-        return torch.where(seen, at, float(count)).long().to(self.grey.device)
+        return torch.where(seen, at, float(count)).long()
 
     def inside(self, positions: Tensor, axis: int) -> Tensor:
         """Which of the ``positions`` are on the canvas, and not behind the right camera; ``(D, n)`` bool."""
         last = self.size[1 - axis] - 1
-        on = (positions >= -EDGE_PX) & (positions <= last + EDGE_PX)
-        return on & (self.scale > 0).to(positions.device)[:, None]
+        return (positions >= -EDGE_PX) & (positions <= last + EDGE_PX) & (self.scale > 0)[:, None]
+
+    def nearest(self, positions: Tensor, axis: int) -> Tensor:
+        """The canvas lines nearest to ``positions``, ``(D, n)`` int64; those outside are its outermost."""
+        return positions.round().clamp_(0, self.size[1 - axis] - 1).long()
 
 
 def align_view(
@@ -99,11 +104,16 @@ def align_view(
 
 def _turned(image: Tensor, to_right: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     """A right image under a homography, from column and row ``low`` to ``high``, and its valid pixels."""
-    columns, rows = (torch.arange(int(a), int(b) + 1, **_CPU_FLOAT64) for a, b in zip(low, high, strict=True))
+    # Not every device has float64; on CUDA the CPU would be waited for.
+    device = image.device if image.is_cuda else low.device
+    columns, rows = (
+        torch.arange(int(a), int(b) + 1, dtype=torch.float64, device=device)
+        for a, b in zip(low, high, strict=True)
+    )
     row, column = torch.meshgrid(rows, columns, indexing="ij")
-    p = torch.stack([column, row, torch.ones_like(row)], dim=-1) @ to_right.T
+    p = torch.stack([column, row, torch.ones_like(row)], dim=-1) @ to_device_of(row, to_right).T
     uv, ahead = p[..., :2] / p[..., 2:].clamp_min(1e-9), p[..., 2] > 1e-9
-    last = uv.new_tensor([image.shape[-1] - 1, image.shape[-2] - 1])
+    last = constant_like(uv, image.shape[-1] - 1, image.shape[-2] - 1)
     valid = ahead & ((uv >= -EDGE_PX) & (uv <= last + EDGE_PX)).all(dim=-1)
     # Bicubic, because the result is interpolated once more on every plane.
     turned = sample_at(image[None], uv[None].to(image), mode="bicubic")[0, 0].clamp(0.0, 1.0)
@@ -154,68 +164,87 @@ def _resampled(grey: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     return grey_levels(grey)
 
 
+@dataclass(frozen=True)
+class EvenShifts:
+    """Planes that are plain shifts along the rows of the canvas, rounded to phases of a pixel."""
+
+    columns: list[int]  # of every plane, in ``_PHASES`` of a pixel
+    rows: list[int]  # of every plane, in ``_ROW_PHASES`` of a pixel
+    first: int  # the leftmost column that a plane reads, before rounding up to its phase
+    count: int  # columns from there that all planes read together
+
+    def phase(self, plane: int) -> tuple[int, int]:
+        """The part of a plane's shift that needs an image of its own: part of a column, and rows."""
+        return self.columns[plane] % _PHASES, self.rows[plane]
+
+    def begin(self, plane: int) -> int:
+        """The column at which the plane begins in the image of its phase."""
+        return self.columns[plane] // _PHASES - self.first
+
+    def lines(self, phase: tuple[int, int], height: int) -> tuple[Tensor, Tensor]:
+        """Rows and columns of the canvas, with a margin, that make the image of a phase; float32."""
+        column, row = phase
+        # Integers would be promoted to the user's default dtype.
+        dtype, device = torch.float32, "cpu"
+        rows = torch.arange(-MARGIN_PX, height + MARGIN_PX, dtype=dtype, device=device)
+        columns = torch.arange(-MARGIN_PX, self.count + MARGIN_PX, dtype=dtype, device=device)
+        return rows.clamp_(0, height - 1) + row / _ROW_PHASES, columns + (self.first + column / _PHASES)
+
+
+def even_shifts(view: AlignedView, width: int) -> EvenShifts | None:
+    """The shifts of a view's planes, for a left grid of this width; ``None`` if some plane is no shift."""
+    scale, shift = view.scale, view.shift
+    drift = float(shift[:, 1].amax() - shift[:, 1].amin())
+    uneven = drift > _MOST_DRIFT_PX or float((scale - 1.0).abs().amax()) * width > 1.0 / _PHASES
+    if uneven or len(scale) < 4 * _PHASES:
+        return None
+    # A plane shifted further than the left width beyond the canvas shows only the repeated edge.
+    columns = (shift[:, 0].clamp(-width, view.size[1]) * _PHASES).round().long().tolist()
+    first = min(columns) // _PHASES
+    rows = (shift[:, 1] * _ROW_PHASES).round().long().tolist()
+    return EvenShifts(columns, rows, first, max(columns) // _PHASES - first + width)
+
+
 class ComparedView:
     """Costs of every plane between the left view and an aligned right view, and where it is seen."""
 
     def __init__(self, left: Tensor, view: AlignedView) -> None:
         """``left`` is the ``census`` of the left view, ``(16, H, W)`` int16."""
         self._view, (_, height, width) = view, left.shape
-        self._columns = view.positions(width, 0, MARGIN_PX)
-        self._rows = view.positions(height, 1, MARGIN_PX)
+        columns, rows = view.positions(width, 0, MARGIN_PX), view.positions(height, 1, MARGIN_PX)
         inner = slice(MARGIN_PX, -MARGIN_PX)
-        self._columns_inside = view.inside(self._columns[:, inner], 0)
-        self._rows_inside = view.inside(self._rows[:, inner], 1)
-        self._shifts = self._even_shifts(width)
+        self._columns_inside = to_device_of(left, view.inside(columns[:, inner], 0))
+        self._rows_inside = to_device_of(left, view.inside(rows[:, inner], 1))
+        self._columns, self._rows = to_device_of(left, columns), to_device_of(left, rows)
+        self._shifts = even_shifts(view, width)
         self._left = left if self._shifts is None else left.to(torch.int8)
         self._work = torch.empty_like(self._left)
         self._phases: dict[tuple[int, int], Tensor] = {}
 
-    def _even_shifts(self, width: int) -> list[tuple[int, int]] | None:
-        """Column and row shift of every plane in phases; ``None`` if planes are more than shifts."""
-        scale, shift = self._view.scale, self._view.shift
-        drift = float(shift[:, 1].amax() - shift[:, 1].amin())
-        uneven = drift > _MOST_DRIFT_PX or float((scale - 1.0).abs().amax()) * width > 1.0 / _PHASES
-        if uneven or len(scale) < 4 * _PHASES:
-            return None
-        # A plane shifted further than the left width beyond the canvas shows only the repeated edge.
-        columns = (shift[:, 0].clamp(-width, self._view.size[1]) * _PHASES).round().long()
-        self._first = int(columns.amin()) // _PHASES
-        self._count = int(columns.amax()) // _PHASES - self._first + width
-        rows = (shift[:, 1] * _ROW_PHASES).round().long()
-        return list(zip(columns.tolist(), rows.tolist(), strict=True))
-
-    def _phase(self, column: int, row: int, height: int) -> Tensor:
+    def _phase(self, phase: tuple[int, int], shifts: EvenShifts) -> Tensor:
         """``census`` of the right view for all shifts of a phase, int8; kept until the row changes."""
-        if (column, row) not in self._phases:
-            self._phases = {key: votes for key, votes in self._phases.items() if key[1] == row}
-            # Integers would be promoted to the user's default dtype.
-            dtype, device = torch.float32, self._columns.device
-            rows = torch.arange(-MARGIN_PX, height + MARGIN_PX, dtype=dtype, device=device)
-            rows = rows.clamp_(0, height - 1) + row / _ROW_PHASES
-            columns = torch.arange(-MARGIN_PX, self._count + MARGIN_PX, dtype=dtype, device=device)
-            columns = columns + (self._first + column / _PHASES)
-            self._phases[column, row] = census(_resampled(self._view.grey, rows, columns)).to(torch.int8)
-        return self._phases[column, row]
+        if phase not in self._phases:
+            self._phases = {key: votes for key, votes in self._phases.items() if key[1] == phase[1]}
+            lines = shifts.lines(phase, self._left.shape[1])
+            rows, columns = (to_device_of(self._left, each) for each in lines)
+            self._phases[phase] = census(_resampled(self._view.grey, rows, columns)).to(torch.int8)
+        return self._phases[phase]
 
     def cost(self, plane: int) -> Tensor:
         """``(H, W)`` uint8, ``census_cost`` of a plane, whether seen or not."""
         if self._shifts is None:
             levels = _resampled(self._view.grey, self._rows[plane], self._columns[plane])
             return census_cost(census(levels, self._work), self._left, self._work)
-        _, height, width = self._left.shape
-        column, row = self._shifts[plane]
-        votes = self._phase(column % _PHASES, row, height)
-        begin = column // _PHASES - self._first
-        return census_cost(votes[:, :, begin : begin + width], self._left, self._work)
+        votes, begin = self._phase(self._shifts.phase(plane), self._shifts), self._shifts.begin(plane)
+        return census_cost(votes[:, :, begin : begin + self._left.shape[2]], self._left, self._work)
 
     def seen(self, plane: int) -> Tensor:
         """``(H, W)`` bool: what the right view sees of a plane."""
         seen = self._rows_inside[plane][:, None] & self._columns_inside[plane]
         if self._view.valid is None:
             return seen
-        rows, columns = (
-            positions[plane, MARGIN_PX:-MARGIN_PX].round().clamp_(0, last - 1).long()
-            for positions, last in zip((self._rows, self._columns), self._view.size, strict=True)
-        )
+        inner = slice(MARGIN_PX, -MARGIN_PX)
+        rows = self._view.nearest(self._rows[plane, inner], 1)
+        columns = self._view.nearest(self._columns[plane, inner], 0)
         valid = self._view.valid.index_select(0, rows)
         return seen & valid.gather(1, columns.expand(len(rows), -1))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.geometry import as_fine_as, image_size, plane_rays, resize_image
+from geodiff_plugin.geometry import as_fine_as, image_size, resize_image, sampled_rays
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
@@ -63,6 +63,15 @@ def to_grid(
     return left, small, K
 
 
+def _on_cpu(matrix: Tensor) -> Tensor:
+    """Cameras and planes stay on the CPU, where every decision about them is taken."""
+    return matrix.detach().to("cpu", torch.float32)
+
+
+def _grey_views(views: Sequence[CameraView]) -> tuple[CameraView, ...]:
+    return tuple(CameraView(grey(image), _on_cpu(K), _on_cpu(T)) for image, K, T in views)
+
+
 def _even_planes(
     span: tuple[Tensor, Tensor],
     size: tuple[int, int],
@@ -73,7 +82,7 @@ def _even_planes(
 ) -> Tensor:
     """Inverse depths over ``span``; from one to the next the median pixel moves by ``step_px``."""
     ends = torch.stack(list(span))
-    shifts = [median_shift(plane_rays(K[None], K_r[None], T[None], size), ends) for _, K_r, T in rights]
+    shifts = [median_shift(sampled_rays(K, K_r, T, size), ends) for _, K_r, T in rights]
     moved = max(float(shift[1] - shift[0]) for shift in shifts)
     wanted = round(moved / step_px) + 1 if math.isfinite(moved) else most  # not finite behind a camera
     count = min(max(wanted, _FEWEST_PLANES), most)
@@ -89,8 +98,7 @@ def pilot_volume(
 
     Its grid has at most ``pixels`` pixels. Other arguments and errors as for ``build_cost_volume``.
     """
-    views = tuple(CameraView(grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
-    left, small, K = to_grid(grey(left_01), views, K_left.float(), pixels)
+    left, small, K = to_grid(grey(left_01), _grey_views(rights), _on_cpu(K_left), pixels)
     size = image_size(left)
     each = _at_shift(small, K, size, PILOT_SHIFT)
     limit = torch.minimum(each.amax(), MOST_NEARER * each.amin())
@@ -104,7 +112,7 @@ def _at_shift(rights: Sequence[CameraView], K: Tensor, size: tuple[int, int], fr
     nearest = []
     for v, (_, K_r, T) in enumerate(rights, 1):
         name = "E" if len(rights) == 1 else f"E of right view {v}"
-        rays = plane_rays(K[None], K_r[None], T[None], size)
+        rays = sampled_rays(K, K_r, T, size)
         nearest.append(inverse_depth_at_shift(rays, fraction * size[1], name))
     return torch.stack(nearest)
 
@@ -112,12 +120,15 @@ def _at_shift(rights: Sequence[CameraView], K: Tensor, size: tuple[int, int], fr
 def _nearest_inverse_depth(pilot: CostVolume) -> Tensor:
     """The inverse depth at which the planes end, somewhat nearer than the matches of a coarse sweep."""
     matches = match_volume(pilot)
-    reliable, limit = matches.confidence > PILOT_CONFIDENCE, pilot.inverse_depth[-1]
+    reliable = matches.confidence > PILOT_CONFIDENCE
     inverse_depth = torch.where(reliable, matches.inverse_depth, torch.nan)
+    # The one number of a sweep for which the device is waited for: how near the planes reach.
+    read = torch.stack([torch.nanquantile(inverse_depth, PILOT_QUANTILE), reliable.float().mean()])
+    nearest, share = read.cpu()
+    limit = pilot.inverse_depth[-1]
     least = _at_shift(pilot.rights, pilot.K, pilot.size, LEAST_SHIFT).amin()
-    nearest = (HEADROOM * torch.nanquantile(inverse_depth, PILOT_QUANTILE)).clamp(least, limit)
     # With few reliable matches the planes must span everything.
-    return torch.where(reliable.float().mean() < PILOT_LEAST_SHARE, limit, nearest)
+    return torch.where(share < PILOT_LEAST_SHARE, limit, (HEADROOM * nearest).clamp(least, limit))
 
 
 @torch.no_grad()
@@ -137,8 +148,7 @@ def build_cost_volume(
     """
     if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
         bad_value("depth_range", "(near, far) in metres with 0 < near < far", depth_range)
-    views = tuple(CameraView(grey(image), K_r.float(), T.float()) for image, K_r, T in rights)
-    left, small, K = to_grid(grey(left_01), views, K_left.float(), config.sweep_pixels)
+    left, small, K = to_grid(grey(left_01), _grey_views(rights), _on_cpu(K_left), config.sweep_pixels)
     if depth_range is None:
         nearest = _nearest_inverse_depth(pilot_volume(left, small, K))
         span = (torch.zeros_like(nearest), nearest)

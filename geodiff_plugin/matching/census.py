@@ -5,16 +5,20 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from geodiff_plugin.geometry import constant_like
+
 #: Half the window: the margin that an image needs around the pixels whose census is taken.
 MARGIN_PX = 3
-# Neighbours along a side of the window: every second one of 7.
-_SIDE = 4
+#: Neighbours along a side of the window: every second one of 7.
+SIDE = 4
 # A difference of this counts as certain; a smaller one in proportion, so that noise hardly votes.
 _CONTRAST = 6.0 / 255.0
 #: A certain vote; the largest for which a cost still fits into a byte.
 VOTE_LEVELS = 7
 #: The cost of two descriptors that differ in everything: 224.
-COST_LEVELS = 2 * VOTE_LEVELS * _SIDE * _SIDE
+COST_LEVELS = 2 * VOTE_LEVELS * SIDE * SIDE
+# Weights of red, green and blue (ITU-R BT.601).
+_LUMA = 0.299, 0.587, 0.114
 
 
 def grey(image_01: Tensor) -> Tensor:
@@ -22,7 +26,7 @@ def grey(image_01: Tensor) -> Tensor:
     image_01 = image_01.float()
     if image_01.shape[0] == 1:
         return image_01
-    return (image_01 * image_01.new_tensor([0.299, 0.587, 0.114])[:, None, None]).sum(dim=0, keepdim=True)
+    return (image_01 * constant_like(image_01, *_LUMA)[:, None, None]).sum(dim=0, keepdim=True)
 
 
 def grey_levels(grey_01: Tensor) -> Tensor:
@@ -41,10 +45,10 @@ def census(levels: Tensor, out: Tensor | None = None) -> Tensor:
     """
     height, width = (side - 2 * MARGIN_PX for side in levels.shape)
     stride = levels.shape[1]
-    neighbours = levels.as_strided((_SIDE, _SIDE, height, width), (2 * stride, 2, stride, 1))
+    neighbours = levels.as_strided((SIDE, SIDE, height, width), (2 * stride, 2, stride, 1))
     centre = levels[MARGIN_PX : MARGIN_PX + height, MARGIN_PX : MARGIN_PX + width]
     if out is None:
-        out = levels.new_empty(_SIDE * _SIDE, height, width)
+        out = levels.new_empty(SIDE * SIDE, height, width)
     torch.sub(neighbours, centre, out=out.view(neighbours.shape))
     return out.clamp_(-VOTE_LEVELS, VOTE_LEVELS)
 

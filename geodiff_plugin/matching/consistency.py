@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._kernels import use_kernel
+from geodiff_plugin.geometry import to_device_of
 from geodiff_plugin.matching.aggregation import PATHS, Buffers, aggregate
 from geodiff_plugin.matching.alignment import AlignedView
 from geodiff_plugin.matching.census import COST_LEVELS
@@ -53,15 +54,27 @@ def _right_winners(volume: CostVolume, view: AlignedView, buffers: Buffers) -> T
     The costs of the sweep are looked up for each pixel of the right view and aggregated along its edges.
     """
     height, width = volume.size
-    # The extra row and column are read by pixels of the right view that the left image does not show.
-    plane = volume.left_01.new_full((height + 1, width + 1), UNSEEN_LEVEL)
     rows, columns = view.sources(height, 1)[:, ::_EVERY_ROW], view.sources(width, 0)
-    size = (rows.shape[1], columns.shape[1])
-    levels = buffers.empty("levels", len(volume.levels), size, volume.levels)
-    for k, of_plane in enumerate(volume.levels):
-        plane[:height, :width] = of_plane
-        levels[k] = plane.index_select(0, rows[k]).index_select(1, columns[k])
+    if use_kernel(volume.levels):
+        from geodiff_plugin.matching import kernels
+
+        levels = kernels.looked_up(volume.levels, rows, columns)
+    else:
+        levels = _looked_up(volume.levels, rows, columns, buffers)
     return _positions(aggregate(levels, view.grey[::_EVERY_ROW], buffers=buffers))
+
+
+def _looked_up(levels: Tensor, rows: Tensor, columns: Tensor, buffers: Buffers) -> Tensor:
+    """The costs ``(D, h, w)`` at the ``sources`` of another view; ``UNSEEN_LEVEL`` where it has none."""
+    planes, height, width = levels.shape
+    rows, columns = to_device_of(levels, rows), to_device_of(levels, columns)
+    # The extra row and column are read by pixels of the other view that the left image does not show.
+    plane = torch.full((height + 1, width + 1), UNSEEN_LEVEL, dtype=torch.float32, device=levels.device)
+    found = buffers.empty("levels", planes, (rows.shape[1], columns.shape[1]), levels)
+    for k, of_plane in enumerate(levels):
+        plane[:height, :width] = of_plane
+        found[k] = plane.index_select(0, rows[k]).index_select(1, columns[k])
+    return found
 
 
 def _disagreement(view: AlignedView, other: Tensor, position: Tensor) -> Tensor:
@@ -70,7 +83,7 @@ def _disagreement(view: AlignedView, other: Tensor, position: Tensor) -> Tensor:
     ``other`` are the right view's ``_right_winners``, ``position (H, W)`` those of the left view.
     """
     device = position.device
-    scale, shift = view.scale.to(device, torch.float32), view.shift.to(device, torch.float32)
+    scale, shift = (to_device_of(position, each.float()) for each in (view.scale, view.shift))
     below = position.floor().long().clamp(0, len(scale) - 2)
     part = position - below
     at_scale = torch.lerp(scale[below], scale[below + 1], part)
@@ -143,4 +156,4 @@ def match_volume(volume: CostVolume) -> Matches:
         probability = torch.sigmoid(odds) * (contrast / LEAST_CONTRAST).clamp_max(1.0)
         agreed = torch.where(difference <= AGREEMENT_PLANES, probability, torch.zeros_like(probability))
         confidence = torch.maximum(confidence, agreed)
-    return Matches(inverse_depth[None], confidence[None], volume.plane_step)
+    return Matches(inverse_depth[None], confidence[None], to_device_of(confidence, volume.plane_step))

@@ -13,7 +13,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from geodiff_plugin.matching.census import COST_LEVELS
+from geodiff_plugin.geometry import to_device_of
+from geodiff_plugin.matching.alignment import AlignedView, even_shifts
+from geodiff_plugin.matching.census import COST_LEVELS, MARGIN_PX, SIDE, VOTE_LEVELS, grey_levels
 from geodiff_plugin.matching.winner import NEVER, PACKED_PLANES, UNSEEN_LEVEL, Winner
 
 # A kernel reads constants of its module only as these.
@@ -21,6 +23,10 @@ _NEVER = tl.constexpr(NEVER)
 _PACKED_PLANES = tl.constexpr(PACKED_PLANES)
 _UNSEEN_LEVEL = tl.constexpr(UNSEEN_LEVEL)
 _COST_LEVELS = tl.constexpr(COST_LEVELS)
+# Pixels and planes of a program of the sweep.
+_COST_BLOCK = 64, 16
+# Samples of the right images that are interpolated at once: 128 MB.
+_SAMPLES_AT_ONCE = 1 << 25
 # Sums that a program of the winner holds at once, in registers of its four warps.
 _SUMS_AT_ONCE = 1024
 
@@ -209,3 +215,186 @@ def _winner(total: Tensor, evidence: tuple[Tensor, Tensor] | None) -> list[Tenso
         num_warps=4,
     )
     return list(maps)
+
+
+@triton.jit
+def census_cost_kernel(
+    left,
+    right,
+    starts,
+    cost_out,
+    planes,
+    pixels,
+    width,
+    left_row,
+    right_row,
+    cost_pixel,
+    SIDE: tl.constexpr,
+    MARGIN: tl.constexpr,
+    VOTE: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PLANES: tl.constexpr,
+):
+    """Census difference of BLOCK pixels on PLANES planes, from grey levels with a margin.
+
+    ``starts`` say where in ``right`` the first left pixel of each plane lies, margin included.
+    """
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    plane = tl.program_id(1) * PLANES + tl.arange(0, PLANES)
+    inside, exists = pixel < pixels, plane < planes
+    used = inside[:, None] & exists[None, :]
+    row, column = pixel // width, pixel % width
+    own = left + row * left_row + column
+    start = tl.load(starts + plane, mask=exists, other=0)
+    other = right + start[None, :] + (row * right_row + column)[:, None]
+    own_centre = tl.load(own + MARGIN * left_row + MARGIN, mask=inside, other=0).to(tl.int32)
+    other_centre = tl.load(other + MARGIN * right_row + MARGIN, mask=used, other=0).to(tl.int32)
+    cost = tl.zeros([BLOCK, PLANES], tl.int32)
+    for down in tl.static_range(0, 2 * SIDE, 2):
+        for across in tl.static_range(0, 2 * SIDE, 2):
+            vote = tl.load(own + down * left_row + across, mask=inside, other=0).to(tl.int32) - own_centre
+            vote = tl.minimum(tl.maximum(vote, -VOTE), VOTE)
+            there = tl.load(other + down * right_row + across, mask=used, other=0).to(tl.int32) - other_centre
+            there = tl.minimum(tl.maximum(there, -VOTE), VOTE)
+            cost += tl.abs(vote[:, None] - there)
+    at = pixel.to(tl.int64)[:, None] * cost_pixel + plane[None, :]
+    tl.store(cost_out + at, cost.to(tl.uint8), mask=used)
+
+
+def census_costs(left: Tensor, view: AlignedView) -> Tensor:
+    """``alignment.ComparedView.cost`` of all planes, ``(D, H, W)`` uint8.
+
+    ``left (H + 6, W + 6)`` are ``grey_levels`` of the left view with a margin.
+    """
+    height, width = (side - 2 * MARGIN_PX for side in left.shape)
+    planes, pixels = len(view.scale), height * width
+    cost = torch.empty(height, width, planes, dtype=torch.uint8, device=left.device)
+    at_once = max(1, _SAMPLES_AT_ONCE // (left.shape[0] * view.size[1]))
+    for first in range(0, planes, at_once):
+        part = range(first, min(planes, first + at_once))
+        right, starts = _right_levels(view, (height, width), part)
+        grid = triton.cdiv(pixels, _COST_BLOCK[0]), triton.cdiv(len(part), _COST_BLOCK[1])
+        census_cost_kernel[grid](
+            left,
+            right,
+            starts,
+            cost[..., first:],
+            len(part),
+            pixels,
+            width,
+            left.stride(0),
+            right.stride(1),
+            planes,
+            SIDE=SIDE,
+            MARGIN=MARGIN_PX,
+            VOTE=VOTE_LEVELS,
+            BLOCK=_COST_BLOCK[0],
+            PLANES=_COST_BLOCK[1],
+            num_warps=4,
+        )
+    return cost.permute(2, 0, 1)
+
+
+def _right_levels(view: AlignedView, size: tuple[int, int], planes: range) -> tuple[Tensor, Tensor]:
+    """Grey levels ``(n, h, w)`` of a right view that some planes need, and where in them each plane begins.
+
+    Planes that are plain shifts by whole pixels from one another share an image.
+    """
+    shifts = even_shifts(view, size[1])
+    if shifts is None:
+        part = slice(planes.start, planes.stop)
+        rows = view.positions(size[0], 1, MARGIN_PX)[part]
+        columns = view.positions(size[1], 0, MARGIN_PX)[part]
+        images, begins = list(range(len(planes))), [0] * len(planes)
+    else:
+        phases = sorted({shifts.phase(plane) for plane in planes})
+        lines = [shifts.lines(phase, size[0]) for phase in phases]
+        rows, columns = (torch.stack(each) for each in zip(*lines, strict=True))
+        images = [phases.index(shifts.phase(plane)) for plane in planes]
+        begins = [shifts.begin(plane) for plane in planes]
+    area = rows.shape[1] * columns.shape[1]
+    starts = [area * image + begin for image, begin in zip(images, begins, strict=True)]
+    levels = _resampled(view.grey, *(to_device_of(view.grey, each) for each in (rows, columns)))
+    return levels, to_device_of(view.grey, torch.tensor(starts, dtype=torch.int64, device="cpu"))
+
+
+def _resampled(grey: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """``alignment._resampled`` of several images at once: ``rows (n, h)``, ``columns (n, w)``."""
+    last_row, last_column = (side - 1 for side in grey.shape)
+    rows, columns = rows.clamp(0, last_row), columns.clamp(0, last_column)
+    first = rows.floor()
+    after = (first + 1.0).clamp_max(last_row)
+    mixed = torch.lerp(grey[first.long()], grey[after.long()], (rows - first)[..., None])
+    first = columns.floor()
+    around = (first, (first + 1.0).clamp_max(last_column))
+    before, behind = (mixed.gather(2, at.long()[:, None].expand(-1, len(mixed[0]), -1)) for at in around)
+    return grey_levels(torch.lerp(before, behind, (columns - first)[:, None]))
+
+
+def seen(view: AlignedView, size: tuple[int, int]) -> Tensor:
+    """``alignment.ComparedView.seen`` of all planes, ``(D, H, W)`` bool."""
+    lines = view.positions(size[0], 1), view.positions(size[1], 0)
+    rows, columns = (
+        to_device_of(view.grey, view.inside(at, axis).T.contiguous())
+        for at, axis in zip(lines, (1, 0), strict=True)
+    )
+    found = rows[:, None] & columns
+    if view.valid is not None:
+        row, column = (
+            to_device_of(view.grey, view.nearest(at, axis).T.contiguous())
+            for at, axis in zip(lines, (1, 0), strict=True)
+        )
+        found &= view.valid[row[:, None], column]
+    return found.permute(2, 0, 1)
+
+
+@triton.jit
+def look_up_kernel(
+    levels,
+    rows,
+    columns,
+    found,
+    planes,
+    pixels,
+    width,
+    levels_height,
+    levels_width,
+    levels_plane,
+    levels_row,
+    levels_column,
+    BLOCK: tl.constexpr,
+    PLANES: tl.constexpr,
+):
+    """Costs of BLOCK pixels on PLANES planes at their ``rows (h, D)`` and ``columns (w, D)``."""
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[:, None]
+    plane = tl.program_id(1) * PLANES + tl.arange(0, PLANES)[None, :]
+    used = (pixel < pixels) & (plane < planes)
+    row = tl.load(rows + (pixel // width) * planes + plane, mask=used, other=0)
+    column = tl.load(columns + (pixel % width) * planes + plane, mask=used, other=0)
+    shown = used & (row < levels_height) & (column < levels_width)
+    at = row.to(tl.int64) * levels_row + column.to(tl.int64) * levels_column + plane * levels_plane
+    cost = tl.load(levels + at, mask=shown, other=_UNSEEN_LEVEL)
+    tl.store(found + pixel.to(tl.int64) * planes + plane, cost, mask=used)
+
+
+def looked_up(levels: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """``consistency._looked_up`` of costs ``(D, H, W)`` at ``AlignedView.sources``."""
+    planes, *size = levels.shape
+    height, width = rows.shape[1], columns.shape[1]
+    found = torch.empty(height, width, planes, dtype=levels.dtype, device=levels.device)
+    at = (to_device_of(levels, each.T.int().contiguous()) for each in (rows, columns))
+    grid = triton.cdiv(height * width, _COST_BLOCK[0]), triton.cdiv(planes, _COST_BLOCK[1])
+    look_up_kernel[grid](
+        levels,
+        *at,
+        found,
+        planes,
+        height * width,
+        width,
+        *size,
+        *levels.stride(),
+        BLOCK=_COST_BLOCK[0],
+        PLANES=_COST_BLOCK[1],
+        num_warps=4,
+    )
+    return found.permute(2, 0, 1)

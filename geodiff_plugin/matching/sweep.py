@@ -11,7 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.geometry import NEAREST_M, PlaneRays, image_size, is_rectified, plane_rays
+from geodiff_plugin._kernels import use_kernel
+from geodiff_plugin.geometry import NEAREST_M, PlaneRays, image_size, is_rectified, sampled_rays
 from geodiff_plugin.matching.aggregation import empty_volume
 from geodiff_plugin.matching.alignment import AlignedView, ComparedView, align_view
 from geodiff_plugin.matching.census import COST_LEVELS, MARGIN_PX, census, grey_levels
@@ -31,7 +32,7 @@ class CostVolume:
 
     levels: Tensor  # (D, H, W) uint8
     in_view: Tensor  # (D, H, W) bool, at least one right view sees the pixel on this plane
-    inverse_depth: Tensor  # (D,) float32, 1/m, ascending and evenly spaced
+    inverse_depth: Tensor  # (D,) float32, 1/m, ascending and evenly spaced; on the CPU, as every camera here
     K: Tensor  # (3, 3) pixels of this grid
     left_01: Tensor  # (1, H, W) grey left image on this grid
     rights: tuple[CameraView, ...]  # grey, at the resolution of the sweep
@@ -60,7 +61,7 @@ class CostVolume:
     @cached_property
     def reach_m(self) -> tuple[float, float]:
         """Metres of the nearest plane, and of a shift of 0.3 px, beyond which depth cannot be measured."""
-        all_rays = [plane_rays(self.K[None], K[None], T[None], self.size) for _, K, T in self.rights]
+        all_rays = [sampled_rays(self.K, K, T, self.size) for _, K, T in self.rights]
         farthest = max(1.0 / float(inverse_depth_at_shift(rays, _LEAST_SHIFT_PX)) for rays in all_rays)
         return 1.0 / float(self.inverse_depth[-1]), farthest
 
@@ -118,21 +119,39 @@ def sweep_planes(
     """Compare the left view ``(1, H, W)``, grey in [0, 1], with the right views on every plane.
 
     Images keep their resolution; the right ones should have about as many pixels per radian. A cost is the
-    mean over the views that see the pixel. ``inverse_depth (D,)`` 1/m is ascending and even, D >= 2. Planes
-    are computed one by one, so memory is that of the result, two bytes per pixel and plane.
+    mean over the views that see the pixel. ``inverse_depth (D,)`` 1/m is ascending and even, D >= 2. The
+    reference computes planes one by one, so that memory is that of the result, two bytes per pixel and plane.
     """
-    size = image_size(left_01)
-    aligned = tuple(align_view(right, K_left, size, inverse_depth) for right in rights)
-    left = census(grey_levels(F.pad(left_01[None], (MARGIN_PX,) * 4, mode="replicate")[0, 0]))
-    compared = [ComparedView(left, view) for view in aligned]
-    levels = empty_volume(len(inverse_depth), size, torch.uint8, left.device)
+    size, planes = image_size(left_01), inverse_depth.cpu()
+    aligned = tuple(align_view(right, K_left, size, planes) for right in rights)
+    left = grey_levels(F.pad(left_01[None], (MARGIN_PX,) * 4, mode="replicate")[0, 0])
+    compare = _all_planes if use_kernel(left) else _plane_by_plane
+    return CostVolume(*compare(left, aligned), planes, K_left.cpu(), left_01, tuple(rights), aligned)
+
+
+def _plane_by_plane(left: Tensor, views: Sequence[AlignedView]) -> tuple[Tensor, Tensor]:
+    """``CostVolume.levels`` and ``CostVolume.in_view`` of ``grey_levels`` of the left view with a margin."""
+    described = census(left)
+    compared = [ComparedView(described, view) for view in views]
+    count, size = len(views[0].scale), image_size(described)
+    levels = empty_volume(count, size, torch.uint8, left.device)
     in_view = left.new_empty(levels.shape, dtype=torch.bool)
     unseen = levels.new_full((), UNSEEN_LEVEL)
-    for plane in range(len(inverse_depth)):
+    for plane in range(count):
         costs, seen = [view.cost(plane) for view in compared], [view.seen(plane) for view in compared]
         cost, in_view[plane] = (costs[0], seen[0]) if len(costs) == 1 else _mean(costs, seen)
         levels[plane] = torch.where(in_view[plane], cost, unseen)
-    return CostVolume(levels, in_view, inverse_depth, K_left, left_01, tuple(rights), aligned)
+    return levels, in_view
+
+
+def _all_planes(left: Tensor, views: Sequence[AlignedView]) -> tuple[Tensor, Tensor]:
+    """``_plane_by_plane`` by the kernel, all planes at once."""
+    from geodiff_plugin.matching import kernels
+
+    costs = [kernels.census_costs(left, view) for view in views]
+    seen = [kernels.seen(view, image_size(costs[0])) for view in views]
+    cost, in_view = (costs[0], seen[0]) if len(views) == 1 else _mean(costs, seen)
+    return torch.where(in_view, cost, UNSEEN_LEVEL), in_view
 
 
 def _mean(costs: list[Tensor], seen: list[Tensor]) -> tuple[Tensor, Tensor]:

@@ -7,10 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin.matching import aggregate
+from geodiff_plugin.matching import aggregate, match_volume, sweep_planes
 from geodiff_plugin.matching.aggregation import jump_penalties
-from geodiff_plugin.matching.census import COST_LEVELS
+from geodiff_plugin.matching.census import COST_LEVELS, grey
 from geodiff_plugin.matching.winner import NEVER, winner, winner_positions
+from geodiff_plugin.types import CameraView
+from tests.conftest import render_plane
 
 SIZES = st.tuples(*(st.integers(1, most) for most in (37, 9, 11)))
 FOUR, EIGHT = [(1, 0), (0, 1)], [(1, 0), (0, 1), (1, 1), (1, -1)]
@@ -49,7 +51,7 @@ def walked(levels: np.ndarray, penalties: np.ndarray, step: int, axes) -> np.nda
     return total
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(SIZES, st.integers(0, 99))
 def test_aggregation_equals_its_reference(device, size, seed):
     levels, _, grey = random_volume(size, seed, device)
@@ -70,7 +72,7 @@ def test_paths_in_any_direction(device, axes, size):
     np.testing.assert_array_equal(found.cpu().numpy(), expected)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(SIZES, st.integers(0, 99))
 def test_the_winner_equals_its_reference(device, size, seed):
     from geodiff_plugin.matching import kernels
@@ -84,6 +86,72 @@ def test_the_winner_equals_its_reference(device, size, seed):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
     torch.testing.assert_close(found.gain, expected.gain, rtol=1e-5, atol=1e-7)
     assert torch.equal(position, winner_positions(total.short()))
+
+
+#: Metres of the right camera's place, and its turn to the side in radians.
+POSES = {
+    "rectified": ((0.12, 0.0, 0.0), 0.0),
+    "a little out of the row": ((0.12, 0.01, 0.0), 0.0),
+    "turned": ((0.15, 0.05, 0.04), 0.12),
+    "ahead": ((0.05, 0.0, 0.3), 0.0),
+}
+
+
+def views_of(names, size: tuple[int, int], device: torch.device):
+    """A rendered left view, its right views under these poses, all grey, and K."""
+    height, width = size
+    K = np.array([[1.1 * width, 0, 0.49 * width], [0, 1.12 * width, 0.48 * height], [0, 0, 1]])
+    surface = size, np.array([0.25, -0.35, 1.0]), 2.0, 0
+    views, left = [], render_plane(K, np.eye(4), *surface)[0]
+    for place, turn in (POSES[name] for name in names):
+        E = np.eye(4)
+        E[:3, :3] = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+        E[:3, 3] = place
+        matrices = (torch.from_numpy(each).float() for each in (K, np.linalg.inv(E)))
+        views.append(CameraView(as_grey(render_plane(K, E, *surface)[0], device), *matrices))
+    return as_grey(left, device), views, torch.from_numpy(K).float()
+
+
+def as_grey(image: np.ndarray, device: torch.device) -> torch.Tensor:
+    return grey(torch.from_numpy(image).permute(2, 0, 1).float().to(device) / 255.0)
+
+
+VIEWS = [(name,) for name in POSES] + [("rectified", "turned"), ("turned", "a little out of the row")]
+
+
+@pytest.mark.parametrize("names", VIEWS)
+@pytest.mark.parametrize(("size", "count"), [((26, 37), 45), ((9, 14), 7)])
+def test_a_sweep_equals_its_reference(device, names, size, count):
+    left, views, K = views_of(names, size, device)
+    planes = torch.linspace(0.0, 1.1, count)
+    found = sweep_planes(left, views, K, planes)
+    with without_kernels():
+        expected = sweep_planes(left, views, K, planes)
+    assert torch.equal(found.in_view, expected.in_view)
+    assert torch.equal(found.levels, expected.levels)
+    assert 0 < found.in_view.float().mean() < 1
+
+
+def test_a_large_canvas_is_interpolated_in_parts(device, monkeypatch):
+    from geodiff_plugin.matching import kernels
+
+    left, views, K = views_of(("turned",), (9, 14), device)
+    whole = sweep_planes(left, views, K, torch.linspace(0.0, 1.1, 40))
+    monkeypatch.setattr(kernels, "_SAMPLES_AT_ONCE", 3 * 15 * whole.aligned[0].size[1])
+    parts = sweep_planes(left, views, K, torch.linspace(0.0, 1.1, 40))
+    assert torch.equal(parts.levels, whole.levels)
+
+
+@pytest.mark.parametrize("names", [("rectified",), ("rectified", "turned")])
+def test_matches_equal_their_reference(device, names):
+    left, views, K = views_of(names, (11, 16), device)
+    planes = torch.linspace(0.0, 1.1, 7)
+    found = match_volume(sweep_planes(left, views, K, planes))
+    with without_kernels():
+        expected = match_volume(sweep_planes(left, views, K, planes))
+    torch.testing.assert_close(found.inverse_depth, expected.inverse_depth, rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(found.confidence, expected.confidence, rtol=1e-5, atol=1e-6)
+    assert expected.confidence.max() > 0
 
 
 def test_few_planes_have_no_runner_up(device):
