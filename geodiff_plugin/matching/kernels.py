@@ -23,8 +23,8 @@ _NEVER = tl.constexpr(NEVER)
 _PACKED_PLANES = tl.constexpr(PACKED_PLANES)
 _UNSEEN_LEVEL = tl.constexpr(UNSEEN_LEVEL)
 _COST_LEVELS = tl.constexpr(COST_LEVELS)
-# Pixels and planes of a program of the sweep.
-_COST_BLOCK = 64, 16
+#: Pixels and planes of a program of the sweep.
+COST_BLOCK = 32, 16
 # Samples of the right images that are interpolated at once: 128 MB.
 _SAMPLES_AT_ONCE = 1 << 25
 # Sums that a program of the winner holds at once, in registers of its four warps.
@@ -273,7 +273,7 @@ def census_costs(left: Tensor, view: AlignedView) -> Tensor:
     for first in range(0, planes, at_once):
         part = range(first, min(planes, first + at_once))
         right, starts = _right_levels(view, (height, width), part)
-        grid = triton.cdiv(pixels, _COST_BLOCK[0]), triton.cdiv(len(part), _COST_BLOCK[1])
+        grid = triton.cdiv(pixels, COST_BLOCK[0]), triton.cdiv(len(part), COST_BLOCK[1])
         census_cost_kernel[grid](
             left,
             right,
@@ -288,8 +288,8 @@ def census_costs(left: Tensor, view: AlignedView) -> Tensor:
             SIDE=SIDE,
             MARGIN=MARGIN_PX,
             VOTE=VOTE_LEVELS,
-            BLOCK=_COST_BLOCK[0],
-            PLANES=_COST_BLOCK[1],
+            BLOCK=COST_BLOCK[0],
+            PLANES=COST_BLOCK[1],
             num_warps=4,
         )
     return cost.permute(2, 0, 1)
@@ -315,7 +315,7 @@ def _right_levels(view: AlignedView, size: tuple[int, int], planes: range) -> tu
     area = rows.shape[1] * columns.shape[1]
     starts = [area * image + begin for image, begin in zip(images, begins, strict=True)]
     levels = _resampled(view.grey, *(to_device_of(view.grey, each) for each in (rows, columns)))
-    return levels, to_device_of(view.grey, torch.tensor(starts, dtype=torch.int64, device="cpu"))
+    return levels, to_device_of(view.grey, torch.tensor(starts, dtype=torch.int32, device="cpu"))
 
 
 def _resampled(grey: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
@@ -383,7 +383,7 @@ def looked_up(levels: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     height, width = rows.shape[1], columns.shape[1]
     found = torch.empty(height, width, planes, dtype=levels.dtype, device=levels.device)
     at = (to_device_of(levels, each.T.int().contiguous()) for each in (rows, columns))
-    grid = triton.cdiv(height * width, _COST_BLOCK[0]), triton.cdiv(planes, _COST_BLOCK[1])
+    grid = triton.cdiv(height * width, COST_BLOCK[0]), triton.cdiv(planes, COST_BLOCK[1])
     look_up_kernel[grid](
         levels,
         *at,
@@ -393,8 +393,8 @@ def looked_up(levels: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
         width,
         *size,
         *levels.stride(),
-        BLOCK=_COST_BLOCK[0],
-        PLANES=_COST_BLOCK[1],
+        BLOCK=COST_BLOCK[0],
+        PLANES=COST_BLOCK[1],
         num_warps=4,
     )
     return found.permute(2, 0, 1)

@@ -24,6 +24,7 @@ from triton.compiler import ASTSource
 from geodiff_plugin.algorithm import kernels as algorithm
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.matching import kernels as matching
+from geodiff_plugin.matching.census import MARGIN_PX, SIDE, VOTE_LEVELS
 from geodiff_plugin.scale import kernels as scale
 
 #: Compute capabilities of an A100 and of an H100.
@@ -48,6 +49,12 @@ class Compiled:
 
 def launches() -> Iterator[Compiled]:
     """Every kernel, at the largest sizes that are usual."""
+    yield from _of_the_matching()
+    yield from _of_the_solver()
+    yield from _of_the_scale()
+
+
+def _of_the_matching() -> Iterator[Compiled]:
     paths = "*u8 *i16 *i32 i32 i32 i32 i32 i32 i32 i32"
     for planes in (128, 256, 512):
         axes = {"DOWN": (1, 0, 1, 1), "ACROSS": (0, 1, 1, -1), "PADDED": planes}
@@ -57,7 +64,15 @@ def launches() -> Iterator[Compiled]:
         sizes = {"EVIDENCE": evidence, "BLOCK": 8, "PADDED": 128}
         name = "winner and evidence" if evidence else "winner"
         yield Compiled(name, matching.winner_kernel, winner, sizes, 4)
-    yield from _of_the_solver()
+    block = dict(zip(("BLOCK", "PLANES"), matching.COST_BLOCK, strict=True))
+    census = {"SIDE": SIDE, "MARGIN": MARGIN_PX, "VOTE": VOTE_LEVELS}
+    sweep = "*i16 *i16 *i32 *u8" + 6 * " i32"
+    yield Compiled("sweep", matching.census_cost_kernel, sweep, census | block, 4)
+    look_up = "*u8 *i32 *i32 *u8" + 8 * " i32"
+    yield Compiled("costs of a right view", matching.look_up_kernel, look_up, block, 4)
+
+
+def _of_the_scale() -> Iterator[Compiled]:
     refine = 9 * "*fp32 " + "i32 i32 fp32 fp32"
     for block in (1024, 16384):
         sizes = {"FORM": scale.FORMS["depth"], "BLOCK": block, "CHUNK": scale.CHUNK}
