@@ -184,7 +184,8 @@ def sampled_rays(
     y = ((at // size[1]).to(K_left) - K_left[1, 2]) / K_left[1, 1]
     x = ((at % size[1]).to(K_left) - K_left[0, 2]) / K_left[0, 0] - K_left[0, 1] / K_left[0, 0] * y
     M = K_right @ T_right_from_left[:3, :3]
-    return (M[:, 2:] + M[:, 1:2] * y + M[:, :1] * x)[None], (K_right @ T_right_from_left[:3, 3:])[None]
+    infinity = M[:, 2:] + M[:, 1:2] * y + M[:, :1] * x
+    return PlaneRays(infinity[None], (K_right @ T_right_from_left[:3, 3:])[None])
 
 
 def project_rays(depth_m: Tensor, rays: PlaneRays) -> tuple[Tensor, Tensor]:
