@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what type checkers and editors see; at run time names are imported on first use
     from geodiff_plugin._checks import InputError as InputError
     from geodiff_plugin.bundled import load_bundled_prior as load_bundled_prior
-    from geodiff_plugin.capture.capture import Capture as Capture
+    from geodiff_plugin.capture.frames import Capture as Capture
     from geodiff_plugin.config import GuidanceConfig as GuidanceConfig
     from geodiff_plugin.evidence.guidance import GeometryGuidance as GeometryGuidance
     from geodiff_plugin.formats.reading import read_calibration as read_calibration
@@ -37,7 +37,7 @@ __version__ = "0.1.0"
 _NAMES_OF = {
     "_checks": "InputError",
     "bundled": "load_bundled_prior",
-    "capture.capture": "Capture",
+    "capture.frames": "Capture",
     "config": "GuidanceConfig",
     "formats.reading": "read_calibration",
     "evidence.guidance": "GeometryGuidance",

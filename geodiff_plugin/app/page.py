@@ -12,6 +12,7 @@ import threading
 import traceback
 from collections import defaultdict
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 from shutil import rmtree
 from types import SimpleNamespace
@@ -168,30 +169,49 @@ def _scene(job: PairResult) -> tuple[Any, str]:
     return view, f'<div class="legend-caption">{count:,} points, {share:.0f} % of the pixels</div>'
 
 
+@dataclass
+class Session:
+    """One open tab: what ends its run, the folders of its uploads, and its last result."""
+
+    stop: threading.Event = field(default_factory=threading.Event)
+    uploads: set[Path] = field(default_factory=set)
+    result: PairResult | None = None
+
+
+class Sessions:
+    """The open tabs by gradio's name for them; a call over the API may have none."""
+
+    def __init__(self) -> None:
+        self._of = defaultdict[str | None, Session](Session)
+
+    def of(self, request: gr.Request) -> Session:
+        """The session of a request."""
+        return self._of[request.session_hash]
+
+    def leave(self, request: gr.Request) -> None:
+        """End a session's run, and delete its result and the uploads that no other one has."""
+        session = self._of.pop(request.session_hash, Session())
+        session.stop.set()
+        _delete(session.uploads.difference(*(other.uploads for other in self._of.values())))
+        _forget(session.result)
+
+
 def _wire_run(
     form: Form, panels: SimpleNamespace, state: gr.State, points: gr.State, tab: gr.State, priors: Priors
 ) -> Callable[[gr.Request], Any]:
     """Everything from the run to its result; what happens when a visitor leaves."""
     fields, turn = list(form.fields.values()), threading.Lock()  # one job runs at a time
-    # By session; a call over the API may have none.
-    stops = defaultdict[str | None, threading.Event](threading.Event)
-    uploads, jobs = defaultdict[str | None, set[Path]](set), dict[str | None, PairResult]()
+    sessions = Sessions()
     fixed = (panels.tabs, panels.pixel, panels.add, panels.clear)
     shows = [component for component in vars(panels).values() if component not in fixed]
 
     def come(request: gr.Request) -> str:
-        stops[request.session_hash] = threading.Event()
+        sessions.of(request).stop = threading.Event()
         return look.BUSY
 
     def stop(request: gr.Request) -> str:
-        stops[request.session_hash].set()
+        sessions.of(request).stop.set()
         return look.STOPPED
-
-    def leave(request: gr.Request) -> None:
-        stop(request)
-        stops.pop(request.session_hash)
-        _delete(uploads.pop(request.session_hash, set()).difference(*uploads.values()))
-        _forget(jobs.pop(request.session_hash, None))
 
     def nothing(status: str) -> dict[Any, Any]:
         """No result, and why."""
@@ -204,19 +224,19 @@ def _wire_run(
         *values: Any,
     ) -> dict[Any, Any]:
         """Depth in metres of the left photograph, with its files."""
-        (*filled, before, opened), visitor = values, request.session_hash
+        (*filled, before, opened), session = values, sessions.of(request)
         try:
-            wanted, ended = form.options(tuple(filled)), stops[visitor]
-            uploads[visitor] |= _uploads(wanted)
+            wanted, ended = form.options(tuple(filled)), session.stop
+            session.uploads |= _uploads(wanted)
             with turn:
-                job = jobs[visitor] = _kept(run_job(wanted, priors, ended, progress), ended)
+                job = session.result = _kept(run_job(wanted, priors, ended, progress), ended)
             return {state: job, points: [], **_everything(panels, job, opened)}
         except Stopped:
             return nothing(look.STOPPED)
         except Exception as error:  # whatever it is, the visitor reads a sentence
             return nothing(look.failed(_sentence(error)))
         finally:
-            stops.pop(visitor, None)
+            session.stop = threading.Event()
             _forget(before)
 
     def take(event: gr.SelectData) -> list[Any]:
@@ -238,7 +258,7 @@ def _wire_run(
     files = [field for field in fields if hasattr(field, "upload")]
     changes = [event for field in files for event in (field.upload, field.clear)]
     gr.on(changes, None, js=look.CHANGED, queue=False)
-    return leave
+    return sessions.leave
 
 
 def _wire_panels(panels: SimpleNamespace, state: gr.State, points: gr.State, tab: gr.State) -> None:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from geodiff_plugin import __version__
 from geodiff_plugin.capture.agreement import DepthFrame, agreed, seen_in
-from geodiff_plugin.capture.capture import Capture
+from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.experiment import Page, run_experiment
 from geodiff_plugin.evaluation.metrics import evaluate_depth

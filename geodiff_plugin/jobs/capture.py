@@ -21,7 +21,7 @@ import torch
 from geodiff_plugin import __version__
 from geodiff_plugin._checks import InputError, bad_value, check_positive, warn
 from geodiff_plugin._threads import WithinCores, available_cores
-from geodiff_plugin.capture.capture import Capture
+from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.capture.results import ALONE, save_alone, write_agreement, write_results
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
@@ -33,7 +33,7 @@ from geodiff_plugin.jobs.runner import BROKEN, Item, Journal, Runner, fingerprin
 from geodiff_plugin.jobs.telling import Tell, collected_warnings, say, silent
 from geodiff_plugin.jobs.writing import write_maps
 from geodiff_plugin.messages import Message, as_records
-from geodiff_plugin.pose.capture import SolvedCapture
+from geodiff_plugin.pose.multiview import SolvedCapture
 from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.types import MetricDepthOutput
 

@@ -33,7 +33,7 @@ OF_SCALE = ("metres_per_unit", "known_length", "distance")
 PHOTOGRAPHS_AND_OUT = ("left", "right", "view", "out")
 
 
-def told_apart(paths: Collection[Path]) -> list[str]:
+def unique_names(paths: Collection[Path]) -> list[str]:
     """Names of files, with their folders below a common one where two are alike."""
     if len({path.stem for path in paths}) == len(paths):
         return [path.name for path in paths]

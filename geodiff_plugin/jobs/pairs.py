@@ -14,7 +14,7 @@ from geodiff_plugin._checks import bad_value, refuse
 from geodiff_plugin.formats.files import MAP_SUFFIXES, check_file, find_map, natural_order
 from geodiff_plugin.formats.out import check_out
 from geodiff_plugin.formats.recordings import VIDEOS, is_bag, is_video, list_pairs, video_facts
-from geodiff_plugin.jobs.options import DepthOptions, check_files, told_apart
+from geodiff_plugin.jobs.options import DepthOptions, check_files, unique_names
 from geodiff_plugin.jobs.telling import Tell, silent
 from geodiff_plugin.messages import Message
 
@@ -178,7 +178,7 @@ def _of_list(path: Path, right: Path | None) -> list[PairRef]:
     if not rows:
         refuse(f"LEFT ({path}) is a list without pairs: write LEFT,RIGHT[,CALIB] on each line.")
     counts, refs = Counter[str](), list[PairRef]()
-    for name, row in zip(told_apart([row[0] for row in rows]), rows, strict=True):
+    for name, row in zip(unique_names([row[0] for row in rows]), rows, strict=True):
         stem = Path(name).with_suffix("").as_posix().replace("/", "_")
         counts[stem] += 1  # one left view with several right ones
         name = stem if counts[stem] == 1 else f"{stem}-{counts[stem]}"

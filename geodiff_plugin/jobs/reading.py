@@ -32,7 +32,7 @@ from geodiff_plugin.formats.lenses import (
 )
 from geodiff_plugin.formats.reading import is_as_stored
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
-from geodiff_plugin.jobs.options import PARAMETERS, DepthOptions, told_apart
+from geodiff_plugin.jobs.options import PARAMETERS, DepthOptions, unique_names
 from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Distortion, Rig
 
@@ -101,7 +101,7 @@ def read_pair(
         rig, guidance = cameras.rig, _posed_guidance(options, images, cameras, known)
     undistorted_any = any(lens is not None for lens in lenses)
     if "colmap" in options.export and not undistorted_any:  # before the work that it would lose
-        check_colmap_names(told_apart(options.photographs().values()))
+        check_colmap_names(unique_names(options.photographs().values()))
     prior_map = None if options.prior_map is None else read_map(options.prior_map, "--prior-map")
     return PairInputs(images[0], rig, guidance, undistorted_any, prior_map, cameras.notes)
 

@@ -10,7 +10,7 @@ from PIL import Image
 
 from geodiff_plugin import formats, plotting
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.jobs.options import DepthOptions, told_apart
+from geodiff_plugin.jobs.options import DepthOptions, unique_names
 from geodiff_plugin.jobs.reading import PairInputs
 from geodiff_plugin.jobs.report import single_map, used_poses
 from geodiff_plugin.types import MetricDepthOutput
@@ -85,7 +85,7 @@ def write_exports(folder: Path, output: MetricDepthOutput, inputs: PairInputs, o
     if "mesh" in options.export:
         formats.write_glb(folder / "mesh.glb", formats.make_mesh(*pixels), cameras)
     if "colmap" in options.export:
-        names = told_apart(options.photographs().values())
+        names = unique_names(options.photographs().values())
         if inputs.undistorted:
             views = [inputs.left, *(image.permute(1, 2, 0).numpy() for image in inputs.guidance.rights)]
             names = [write_undistorted(folder, image, number) for number, image in enumerate(views, 1)]

@@ -15,7 +15,7 @@ pytest.importorskip("pycolmap")
 
 from geodiff_plugin import Capture, InputError
 from geodiff_plugin.capture.agreement import DepthFrame, agreed
-from geodiff_plugin.capture.capture import choose_neighbours
+from geodiff_plugin.capture.frames import choose_neighbours
 from geodiff_plugin.capture.results import fuse, write_map, write_mesh
 from geodiff_plugin.cli.run import run_capture, summary
 from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED
@@ -26,14 +26,14 @@ from geodiff_plugin.jobs import capture as run
 from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.plotting import grid
-from geodiff_plugin.pose.capture import SolvedCapture, candidate_pairs, solve_capture
+from geodiff_plugin.pose.multiview import SolvedCapture, candidate_pairs, solve_capture
 from geodiff_plugin.result.indicators import Indicators
 from geodiff_plugin.result.verdict import judge
 from tests.cli.conftest import call
 from tests.unit.capture_room import FLIP, HALF, SIZE, K, perturbed, render, walk, write_transforms
 
 COUNT = 10
-SOLVE = "geodiff_plugin.capture.capture.solve_capture"
+SOLVE = "geodiff_plugin.capture.frames.solve_capture"
 TRUE = walk(COUNT)
 GIVEN = perturbed(TRUE, shift=0.015, turn_deg=2.0, seed=1)
 

@@ -10,7 +10,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import InputError
-from geodiff_plugin.capture.capture import Capture
+from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.clouds import Cloud
 from geodiff_plugin.formats.colmap import MODELS, write_colmap

@@ -23,7 +23,7 @@ from geodiff_plugin.formats.layouts import CaptureFrame
 from geodiff_plugin.formats.lenses import undistorted
 from geodiff_plugin.formats.recordings import VideoReader
 from geodiff_plugin.messages import Message
-from geodiff_plugin.pose.capture import SolvedCapture, solve_capture
+from geodiff_plugin.pose.multiview import SolvedCapture, solve_capture
 from geodiff_plugin.types import MetricDepthOutput
 
 #: A solve that moved the given poses, or estimated them; its points count from this many frames on.
