@@ -15,8 +15,8 @@ import torch
 from PIL import Image
 
 from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_number, check_positive
+from geodiff_plugin._strips import row_strips
 from geodiff_plugin.formats.clouds import in_8_bits
-from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.formats.out import atomic_path, reason_of
 
 #: ``(H, W)``, of a picture ``(H, W, 3)``.

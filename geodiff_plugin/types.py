@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from diffusers.utils import BaseOutput
 
 from geodiff_plugin.messages import Message
+
+#: Why a depth is not judged.
+UNTESTED = "neither matches of two views nor enough known depths, all over the image, test it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +127,63 @@ class StepReport:
     visible_fraction: torch.Tensor | None = None  # (B,) pixels that a right view sees; 0 without a view
 
 
+@dataclass(frozen=True)
+class Indicators:
+    """Numbers of one image's run; NaN where unknown."""
+
+    confidence: float = math.nan  # mean of the confidence map, [0, 1]
+    matched: float = math.nan  # share of the left image with a match that both views agree on, [0, 1]
+    rank_correlation: float = math.nan  # of the prior's first map with matches or points, [-1, 1]
+    spread: float = math.nan  # of the matched depths, log of their 95 % over their 5 % quantile
+    points_ratio: float = math.nan  # median of known points over matched depths at the same places
+    points_off: float = math.nan  # share of the points that differ from the matches by 1.2 or more
+    points: int = 0  # number of known depths within the image
+    cover: float = 0.0  # share of 8x8 equal parts of the image in which they lie
+    at_end: float = 0.0  # share of the confident matches on the first or the last plane of a given range
+    baseline_m: float = 0.0  # distance of the first right camera; 0 without one, or where it has no unit
+    view_deg: float = math.nan  # horizontal field of view that K gives the left image
+    prior_ratio: float = math.nan  # median of the depth over a metric prior's depth
+    epipolar_px: float = math.nan  # median distance of matches from their epipolar lines, the worst view's
+    given_px: float = math.nan  # the same distance under the poses as given
+    scale_spread: float = math.nan  # relative standard deviation of a refined pose's scale, if in metres
+    off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
+    doubts: tuple[Message, ...] = ()  # warnings about the input, each of which forbids trust
+    mistakes: tuple[Message, ...] = ()  # of a given pose, that would explain its misfit (``pose.mistakes``)
+    flat: bool = False  # all confident matches lie within two planes, and near enough to mean something
+    same: bool = False  # the left and a right view are the same picture
+    inverse_fits: bool = False  # the inverse pose matches clearly more
+    on_edge: bool = False  # the search for the scale ended on the edge of its range
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether one image's depth can be trusted."""
+
+    status: str  # "trusted", "not trusted", or "not judged": there was nothing to compare it with
+    reasons: tuple[Message, ...]  # what speaks against it, the likeliest cause first
+    remarks: tuple[Message, ...]  # what is unusual but may be right
+    indicators: Indicators
+
+    @property
+    def message(self) -> Message | None:
+        """The verdict for the user; ``None`` where it is trusted."""
+        if self.trusted:
+            return None
+        if self.status == "not judged":
+            return Message("verdict.not-judged", f"This depth was not judged: {UNTESTED}.")
+        return Message("verdict.not-trusted", f"Do not trust this depth: {' '.join(self.reasons)}")
+
+    @property
+    def sentence(self) -> str:
+        """The sentence of ``message``; empty where it is trusted."""
+        return self.message or ""
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the status is ``"trusted"``."""
+        return self.status == "trusted"
+
+
 @dataclass
 class MetricDepthOutput(BaseOutput):
     """Metric depth with confidence, diagnostics and warnings.
@@ -153,7 +214,7 @@ class MetricDepthOutput(BaseOutput):
         history: one ``StepReport`` per round of a guided step and batch chunk.
         poses: one ``PoseReport`` per image with right views.
         extras: further maps of the prior by name (GeoWizard's ``"normals"``), but for their channels.
-        verdicts: one ``result.verdict.Verdict`` per image: whether the depth can be trusted, and why not.
+        verdicts: one ``Verdict`` per image: whether the depth can be trusted, and why not.
         unit: ``"m"``, or ``None`` if no length is known: lengths are then in the unit of the given poses, or
             of the first estimated baseline.
         scale_from: source of the scale of estimated poses: ``"baseline"``, ``"known length"``, ``"points"``,
@@ -186,12 +247,12 @@ class MetricDepthOutput(BaseOutput):
     scale_spread: float | None = None
     rescaled: float = 1.0
     extras: dict[str, np.ndarray | torch.Tensor] = field(default_factory=dict)
-    verdicts: list[Any] = field(default_factory=list)
+    verdicts: list[Verdict] = field(default_factory=list)
     warnings: list[Message] = field(default_factory=list)
     assumed: list[Message] = field(default_factory=list)
 
     @property
-    def verdict(self) -> Any:
+    def verdict(self) -> Verdict:
         """The verdict on all images: the first that is not trusted, else not judged, else trusted."""
         if not self.verdicts:
             raise AttributeError("This output has no verdict: no guided call made it.")
@@ -206,3 +267,22 @@ class MetricDepthOutput(BaseOutput):
         lines += [": ".join([verdict.status, *verdict.reasons[:1]]) for verdict in self.verdicts]
         lines += [f"{len(self.warnings)} warnings", f"{len(self.assumed)} assumptions"]
         return "MetricDepthOutput(" + "\n  ".join(lines) + ")"
+
+
+@dataclass(frozen=True, eq=False)
+class DepthFrame:
+    """Depth of one frame of a capture, as it goes from the runs to agreement and the cloud."""
+
+    name: str
+    depth: np.ndarray  # (H, W) z
+    confidence: np.ndarray  # (H, W) in [0, 1]
+    K: np.ndarray  # (3, 3) pixels
+    E: np.ndarray  # (4, 4) camera-to-world
+    confirmed: np.ndarray | None = None  # (H, W) how many other frames have the same depth there
+    asked: np.ndarray | None = None  # (H, W) how many see the point by this depth, or a surface before it
+
+    def world(self, mask: np.ndarray | None = None) -> np.ndarray:
+        """``(N, 3)`` points of the pixels of a mask, by default of all, in the world's frame."""
+        v, u = np.nonzero(np.ones(self.depth.shape, bool) if mask is None else mask)
+        rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(self.K).T
+        return rays * self.depth[v, u][:, None] @ self.E[:3, :3].T + self.E[:3, 3]

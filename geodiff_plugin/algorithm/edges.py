@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.formats.depth import row_strips
+from geodiff_plugin._strips import row_strips
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.scale.points import weighted_quantile
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from geodiff_plugin.pose.tracks import LONG_SIDE, grey_image, match_features, sift_features
+from geodiff_plugin.types import DepthFrame
 
 #: Two depths of one point agree within this share.
 SAME_SHARE = 0.06
@@ -31,25 +32,6 @@ STEADY = 3
 SURE = 0.8
 #: The motion of a camera is known if so many matches fit it, to within so many pixels of the shrunk pictures.
 LEAST_INLIERS, INLIER_PX = 20, 1.5
-
-
-@dataclass(frozen=True, eq=False)
-class DepthFrame:
-    """Depth of one frame of a capture, as it goes from the runs to agreement and the cloud."""
-
-    name: str
-    depth: np.ndarray  # (H, W) z
-    confidence: np.ndarray  # (H, W) in [0, 1]
-    K: np.ndarray  # (3, 3) pixels
-    E: np.ndarray  # (4, 4) camera-to-world
-    confirmed: np.ndarray | None = None  # (H, W) how many other frames have the same depth there
-    asked: np.ndarray | None = None  # (H, W) how many see the point by this depth, or a surface before it
-
-    def world(self, mask: np.ndarray | None = None) -> np.ndarray:
-        """``(N, 3)`` points of the pixels of a mask, by default of all, in the world's frame."""
-        v, u = np.nonzero(np.ones(self.depth.shape, bool) if mask is None else mask)
-        rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(self.K).T
-        return rays * self.depth[v, u][:, None] @ self.E[:3, :3].T + self.E[:3, 3]
 
 
 class SeenIn(NamedTuple):

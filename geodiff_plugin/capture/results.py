@@ -13,7 +13,7 @@ from PIL import Image, ImageOps
 
 from geodiff_plugin import plotting
 from geodiff_plugin._checks import InputFileError, warn
-from geodiff_plugin.capture.agreement import DepthFrame, agreed, scene_poses, steadied
+from geodiff_plugin.capture.agreement import agreed, scene_poses, steadied
 from geodiff_plugin.capture.frames import Capture, choose_neighbours
 from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb, write_vertices
 from geodiff_plugin.formats.colmap import write_colmap
@@ -21,6 +21,7 @@ from geodiff_plugin.formats.depth import write_depth_mm, write_depth_npy
 from geodiff_plugin.formats.out import atomic_path, write_text
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.multiview import Observations
+from geodiff_plugin.types import DepthFrame
 
 #: Depth and confidence of a frame by its own run, which agreement starts from whenever it is made anew.
 ALONE = ("depth_alone", "confidence_alone")

@@ -23,7 +23,7 @@ from geodiff_plugin.jobs.records import JobLog
 from geodiff_plugin.jobs.report import report_text, summary_line
 from geodiff_plugin.jobs.runner import this_process
 from geodiff_plugin.jobs.telling import Tell, collected_warnings, say, silent
-from geodiff_plugin.result.verdict import UNTESTED
+from geodiff_plugin.types import UNTESTED
 
 #: A table of more pairs than this shows only failed and untrusted ones.
 MOST_ROWS = 20

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from geodiff_plugin import __version__
-from geodiff_plugin.capture.agreement import DepthFrame, agreed, seen_in
+from geodiff_plugin.capture.agreement import agreed, seen_in
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.experiment import Page, run_experiment
@@ -20,6 +20,7 @@ from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.options import CAPTURE_ROWS, CaptureEvalOptions, CaptureRow
 from geodiff_plugin.evaluation.tables import CellOf, Table, grouped, mean_of, table_of_groups
 from geodiff_plugin.jobs.runner import Item, Record, fingerprint
+from geodiff_plugin.types import DepthFrame
 
 #: A point whose depth in the next frame differs by more than this share is hidden there, and counts not.
 HIDDEN_SHARE = 0.3

@@ -27,7 +27,7 @@ import torch.nn.functional as F
 
 from geodiff_plugin import __version__
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.capture.agreement import DepthFrame, seen_in
+from geodiff_plugin.capture.agreement import seen_in
 from geodiff_plugin.evaluation import metrics
 from geodiff_plugin.evaluation.baselines import (
     Method,
@@ -49,6 +49,7 @@ from geodiff_plugin.jobs.runner import Item, Journal, Record, Runner, fingerprin
 from geodiff_plugin.matching import match_volume
 from geodiff_plugin.result.confidence import RIGHT_WITHIN
 from geodiff_plugin.runtime.machine import PeakMemory, versions
+from geodiff_plugin.types import DepthFrame
 
 #: Journal of methods on samples, which several commands share.
 RECORDS_NAME = "samples.jsonl"

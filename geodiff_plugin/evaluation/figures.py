@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import check_choice
 from geodiff_plugin.algorithm.terms import masked_mean, photometric_map
-from geodiff_plugin.capture.agreement import DepthFrame, rendered
+from geodiff_plugin.capture.agreement import rendered
 from geodiff_plugin.evaluation.baselines import METHODS, NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, load, select
 from geodiff_plugin.evaluation.experiment import in_metres, measure_cells, method_cells, run_facts
@@ -33,6 +33,7 @@ from geodiff_plugin.geometry import warp_right_to_left
 from geodiff_plugin.jobs.runner import Record
 from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, grid, rasterised, ticks
 from geodiff_plugin.scale.space import SPACES, smooth_floor
+from geodiff_plugin.types import DepthFrame
 
 #: A picture or a figure of matplotlib, and what it shows as JSON values.
 Drawing = tuple[Any, dict[str, Any]]

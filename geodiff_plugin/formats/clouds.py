@@ -13,7 +13,7 @@ from PIL import Image
 
 from geodiff_plugin._camera_checks import check_intrinsics
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.formats.depth import row_strips
+from geodiff_plugin._strips import row_strips
 from geodiff_plugin.formats.files import PathLike
 from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin._checks import bad_value, check_number
+from geodiff_plugin._strips import row_strips
 from geodiff_plugin.formats.files import PathLike, check_file, open_image, read_npy
 from geodiff_plugin.formats.maps import read_map_file, read_pfm
 from geodiff_plugin.formats.out import atomic_path
@@ -18,19 +18,10 @@ if TYPE_CHECKING:  # which imports torch
     from geodiff_plugin.types import Rig
 
 LARGEST_MM, MILLIMETRES, KITTI_UNITS = 65535, 1000.0, 256.0
-#: Pixels of a strip: a map of float64 of so many is 8 MB.
-STRIP_PIXELS = 1 << 20
 #: Disparities of which this share is negative have another sign.
 MOST_NEGATIVE = 0.5
 #: Maps of these are 0 where unknown.
 PICTURES = (".png", ".tif", ".tiff")
-
-
-def row_strips(height: int, width: int) -> Iterator[slice]:
-    """Slices of at most ``STRIP_PIXELS`` pixels, or one row, that cover all rows: arrays stay small."""
-    rows = max(1, STRIP_PIXELS // max(1, width))
-    for top in range(0, height, rows):
-        yield slice(top, min(top + rows, height))
 
 
 def write_pfm(path: PathLike, values: np.ndarray) -> None:

@@ -17,9 +17,8 @@ from geodiff_plugin.formats.out import REPORT
 from geodiff_plugin.jobs.records import PairRun
 from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.result.confidence import expected_error
-from geodiff_plugin.result.verdict import UNTESTED
 from geodiff_plugin.runtime.machine import versions
-from geodiff_plugin.types import MetricDepthOutput
+from geodiff_plugin.types import UNTESTED, MetricDepthOutput
 
 
 def read_report(folder: Path) -> dict[str, Any]:

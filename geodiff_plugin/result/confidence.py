@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._strips import row_strips
 from geodiff_plugin.algorithm.terms import match_exposure
-from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.geometry import as_fine_as, image_size, warp_right_to_left
 from geodiff_plugin.types import CameraView
 

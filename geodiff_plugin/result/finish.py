@@ -23,10 +23,11 @@ from geodiff_plugin.matching import Matches, build_cost_volume, match_volume
 from geodiff_plugin.messages import Message
 from geodiff_plugin.result.confidence import depth_confidence, reprojection
 from geodiff_plugin.result.ensemble import median, spread_around
-from geodiff_plugin.result.indicators import Indicators, indicators_of, measure_indicators, read_numbers
-from geodiff_plugin.result.verdict import Verdict, judge, points_agreement
+from geodiff_plugin.result.indicators import indicators_of, measure_indicators, read_numbers
+from geodiff_plugin.result.verdict import judge, points_agreement
 from geodiff_plugin.result.voting import vote_depth
 from geodiff_plugin.scale.points import order_agreement
+from geodiff_plugin.types import Indicators, Verdict
 
 #: Least depth of a metric prior, metres: its nearest pixel may be 0.
 LEAST_M = 1e-6

@@ -1,22 +1,21 @@
-"""``Indicators``: the numbers of one image's result by which its verdict is decided."""
+"""Measures ``Indicators``: the numbers of one image's result by which its verdict is decided."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._strips import row_strips
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.formats.depth import row_strips
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.mistakes import INVERSE
+from geodiff_plugin.types import Indicators
 
 #: Matches above this confidence count.
 CONFIDENT = 0.5
@@ -36,34 +35,6 @@ MOST_SORTED = 1 << 22
 FLAT = 0.2
 #: A point that differs from the matches by this factor contradicts them (log).
 POINTS_WRONG = math.log(1.2)
-
-
-@dataclass(frozen=True)
-class Indicators:
-    """Numbers of one image's run; NaN where unknown."""
-
-    confidence: float = math.nan  # mean of the confidence map, [0, 1]
-    matched: float = math.nan  # share of the left image with a match that both views agree on, [0, 1]
-    rank_correlation: float = math.nan  # of the prior's first map with matches or points, [-1, 1]
-    spread: float = math.nan  # of the matched depths, log of their 95 % over their 5 % quantile
-    points_ratio: float = math.nan  # median of known points over matched depths at the same places
-    points_off: float = math.nan  # share of the points that differ from the matches by 1.2 or more
-    points: int = 0  # number of known depths within the image
-    cover: float = 0.0  # share of 8x8 equal parts of the image in which they lie
-    at_end: float = 0.0  # share of the confident matches on the first or the last plane of a given range
-    baseline_m: float = 0.0  # distance of the first right camera; 0 without one, or where it has no unit
-    view_deg: float = math.nan  # horizontal field of view that K gives the left image
-    prior_ratio: float = math.nan  # median of the depth over a metric prior's depth
-    epipolar_px: float = math.nan  # median distance of matches from their epipolar lines, the worst view's
-    given_px: float = math.nan  # the same distance under the poses as given
-    scale_spread: float = math.nan  # relative standard deviation of a refined pose's scale, if in metres
-    off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
-    doubts: tuple[Message, ...] = ()  # warnings about the input, each of which forbids trust
-    mistakes: tuple[Message, ...] = ()  # of a given pose, that would explain its misfit (``pose.mistakes``)
-    flat: bool = False  # all confident matches lie within two planes, and near enough to mean something
-    same: bool = False  # the left and a right view are the same picture
-    inverse_fits: bool = False  # the inverse pose matches clearly more
-    on_edge: bool = False  # the search for the scale ended on the edge of its range
 
 
 def read_numbers(numbers: Mapping[str, Tensor]) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""``Verdict``: whether a result can be trusted, and if not, why; judged by the ``Indicators`` of a run.
+"""Judges the ``Indicators`` of a run: whether its result can be trusted, and if not, why.
 
 No indicator shows a wrong focal length of a rectified pair, or a wrong baseline of a plausible length.
 """
@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from geodiff_plugin.messages import Message
-from geodiff_plugin.result.indicators import POINTS_WRONG, Indicators
+from geodiff_plugin.result.indicators import POINTS_WRONG
+from geodiff_plugin.types import Indicators, Verdict
 
 #: A depth that differs from the matches by this in the median of the absolute log is not trusted.
 OFF_MATCHES = math.log(1.2)
@@ -80,36 +81,6 @@ FACTORS = {
     0.3048: "metres taken for feet",
 }
 NEARLY = math.log(1.04)
-UNTESTED = "neither matches of two views nor enough known depths, all over the image, test it"
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Whether one image's depth can be trusted."""
-
-    status: str  # "trusted", "not trusted", or "not judged": there was nothing to compare it with
-    reasons: tuple[Message, ...]  # what speaks against it, the likeliest cause first
-    remarks: tuple[Message, ...]  # what is unusual but may be right
-    indicators: Indicators
-
-    @property
-    def message(self) -> Message | None:
-        """The verdict for the user; ``None`` where it is trusted."""
-        if self.trusted:
-            return None
-        if self.status == "not judged":
-            return Message("verdict.not-judged", f"This depth was not judged: {UNTESTED}.")
-        return Message("verdict.not-trusted", f"Do not trust this depth: {' '.join(self.reasons)}")
-
-    @property
-    def sentence(self) -> str:
-        """The sentence of ``message``; empty where it is trusted."""
-        return self.message or ""
-
-    @property
-    def trusted(self) -> bool:
-        """Whether the status is ``"trusted"``."""
-        return self.status == "trusted"
 
 
 def points_agreement(found: Indicators) -> float:

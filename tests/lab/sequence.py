@@ -15,13 +15,14 @@ import numpy as np
 import torch
 
 from geodiff_plugin import __version__
-from geodiff_plugin.capture.agreement import DepthFrame, scene_poses, seen_in, steadied
+from geodiff_plugin.capture.agreement import scene_poses, seen_in, steadied
 from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.experiment import Page, run_experiment
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, most_of, table_of_groups
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.jobs.runner import Item, Record, fingerprint
+from geodiff_plugin.types import DepthFrame
 from tests.lab.options import WAYS, SequenceOptions
 from tests.scenes import SyntheticSequence, render_sequence
 

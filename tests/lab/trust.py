@@ -16,7 +16,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import InputError, bad_value, check_choice
-from geodiff_plugin.capture.agreement import DepthFrame
 from geodiff_plugin.evaluation import experiment, tables
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import call_arguments, guided_configuration
@@ -25,6 +24,7 @@ from geodiff_plugin.evaluation.experiment import Page, run_experiment
 from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.jobs.runner import Item, Record
+from geodiff_plugin.types import DepthFrame
 from tests.lab.options import TrustOptions
 
 #: A depth further off than this, as a share of the truth at the median pixel, is wrong enough to be told.

@@ -245,7 +245,7 @@ def test_sharpening_gives_depths_that_are_there_whatever_the_strips(monkeypatch)
     left = torch.rand(2, 3, 48, 64, generator=generator)
     whole = sharpen_edges(soft, left, 2)
     assert not torch.equal(whole, soft) and torch.isin(whole, soft).all()
-    monkeypatch.setattr("geodiff_plugin.formats.depth.STRIP_PIXELS", 5 * 64)
+    monkeypatch.setattr("geodiff_plugin._strips.STRIP_PIXELS", 5 * 64)
     monkeypatch.setattr(edges, "STRIP", 7)
     assert torch.equal(sharpen_edges(soft, left, 2), whole)
 

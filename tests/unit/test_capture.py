@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("pycolmap")
 
 from geodiff_plugin import Capture, InputError
-from geodiff_plugin.capture.agreement import DepthFrame, agreed
+from geodiff_plugin.capture.agreement import agreed
 from geodiff_plugin.capture.frames import choose_neighbours
 from geodiff_plugin.capture.results import fuse, write_map, write_mesh
 from geodiff_plugin.cli.run import run_capture, summary
@@ -27,8 +27,8 @@ from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.plotting import grid
 from geodiff_plugin.pose.multiview import SolvedCapture, candidate_pairs, solve_capture
-from geodiff_plugin.result.indicators import Indicators
 from geodiff_plugin.result.verdict import judge
+from geodiff_plugin.types import DepthFrame, Indicators
 from tests.cli.conftest import call
 from tests.unit.capture_room import FLIP, HALF, SIZE, K, perturbed, render, walk, write_transforms
 

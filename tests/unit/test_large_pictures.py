@@ -5,9 +5,9 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin.formats import depth as strips
+from geodiff_plugin import _strips as strips
 from geodiff_plugin.formats import flying_points, make_cloud, write_depth_mm, write_ply
-from geodiff_plugin.formats.depth import read_ply_points
+from geodiff_plugin.formats.points import read_ply_points
 from geodiff_plugin.plotting import colour_depth, share_figure
 from geodiff_plugin.result.confidence import depth_confidence, reprojection
 from geodiff_plugin.types import CameraView

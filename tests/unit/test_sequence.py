@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from geodiff_plugin.capture.agreement import DepthFrame, scene_poses, steadied
+from geodiff_plugin.capture.agreement import scene_poses, steadied
+from geodiff_plugin.types import DepthFrame
 from tests.lab.sequence import flicker, true_frames
 from tests.scenes import render_sequence
 

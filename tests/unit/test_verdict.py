@@ -12,8 +12,8 @@ from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.messages import Message
 from geodiff_plugin.result.confidence import depth_confidence
-from geodiff_plugin.result.indicators import Indicators
 from geodiff_plugin.result.verdict import judge
+from geodiff_plugin.types import Indicators
 from tests.scenes import render_pair
 
 GOOD = Indicators(
