@@ -79,6 +79,21 @@ def untouched(rights: Sequence[CameraView], status: str = "given") -> _Refined:
     return tuple(rights), PoseReport(status, poses, poses)
 
 
+@dataclass(frozen=True, eq=False)
+class _Misfit:
+    """Right views whose poses do not fit, and what is known of them."""
+
+    rights: Sequence[CameraView]
+    sizes: Sequence[tuple[int, int]]  # (H, W) of the right images that the tracks are of
+    tracks: Tracks
+    given: np.ndarray  # (V, 4, 4) T_right_from_left
+    near: np.ndarray  # (V, 4, 4) poses near the given ones that fit roughly
+    fits_px: float  # residual below which a pose fits
+    rig: bool  # a rectified one
+    measured: bool  # whether the lengths of the baselines are
+    units: tuple[Message, ...]  # on implausible ones
+
+
 def refine_views(
     left_01: Tensor,
     rights: Sequence[CameraView],
@@ -103,42 +118,52 @@ def refine_views(
     report = PoseReport("fits", poses, poses, residual_px, residual_px, tuple(map(float, counts)))
     rig = is_rig(sparse, given)
     fits_px = FITS_PX if rig else POSED_FITS_PX
-    misfit = bool((before > fits_px).any())
-    near = nearby_poses(sparse, given, before) if misfit else given
+    fits = not (before > fits_px).any()
+    near = given if fits else nearby_poses(sparse, given, before)
     units = _messages(sparse, implausible_unit, given) if unit == "m" else ()
     if mistakes := _messages(sparse, find_mistake, given, near):
         return tuple(rights), replace(report, status="mistaken", warnings=mistakes)
-    if not misfit:
+    if fits:
         return tuple(rights), replace(report, warnings=units)
     depth_m = coarse_depth(left_01, _applied(rights, near), K_left, views[0][0].shape)
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
+    sizes = [(image.shape[0], image.shape[1]) for image, _ in views[1:]]
+    return _refined(_Misfit(rights, sizes, tracks, given, near, fits_px, rig, measured, units), report)
+
+
+def _refined(misfit: _Misfit, report: PoseReport) -> _Refined:
+    """The views with poses that fit better, and images without the residuals that no pose explains.
+
+    The given views where no pose near them is better, or the better one is too far away.
+    """
+    rights, tracks, given = misfit.rights, misfit.tracks, misfit.given
     before = median_residuals(tracks, given)
-    Ts, free = settle_poses(tracks, given, near, before, rig)
+    Ts, free = settle_poses(tracks, given, misfit.near, before, misfit.rig)
     after, worst = median_residuals(tracks, Ts), int(np.argmax(np.nan_to_num(before)))
     residual_px, matches = tuple(before.tolist()), tuple(map(float, tracks.seen.sum(1)))
     report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
     doubts = undecided(tracks, Ts, free)
     if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
-        return tuple(rights), replace(
-            report, status="kept", warnings=_kept_misfit(before, worst) + doubts + units
-        )
+        warnings = _kept_misfit(before, worst) + doubts + misfit.units
+        return tuple(rights), replace(report, status="kept", warnings=warnings)
     turned_deg, shifts = pose_change(given, Ts)
     far = ~((turned_deg < _MOST_TURN_DEG) & (shifts < _MOST_SHIFT))
     if far.any():
         v = int(np.lexsort((np.nan_to_num(before), far & ~np.isnan(before)))[-1])  # the worst of the far ones
-        warnings = _too_far(before, after, v, turned_deg[v], shifts[v])
-        return tuple(rights), replace(report, status="kept", warnings=warnings + units)
-    Ts, spread = (Ts, None) if rig or measured else _rescaled(tracks, given, Ts, before)
+        warnings = _too_far(before, after, v, turned_deg[v], shifts[v]) + misfit.units
+        return tuple(rights), replace(report, status="kept", warnings=warnings)
+    keeps_length = misfit.rig or misfit.measured
+    Ts, spread = (Ts, None) if keeps_length else _rescaled(tracks, given, Ts, before)
     bends = [
-        None if not before[v] > fits_px else fit_displacement(tracks.view(v), T, views[v + 1][0].shape)
-        for v, T in enumerate(Ts)
+        fit_displacement(tracks.view(v), T, size) if before[v] > misfit.fits_px else None
+        for v, (T, size) in enumerate(zip(Ts, misfit.sizes, strict=True))
     ]
     pairs = zip(tracks.right_px, bends, strict=True)
     straight = np.stack([px if bend is None else px + bend.at(px) for px, bend in pairs])
     report = replace(
         report,
         status="refined",
-        warnings=_refined_misfit(before, after, worst) + doubts + units,
+        warnings=_refined_misfit(before, after, worst) + doubts + misfit.units,
         scale_spread=spread,
         E=_as_E(Ts),
         residual_px=tuple(median_residuals(replace(tracks, right_px=straight), Ts).tolist()),
