@@ -41,6 +41,11 @@ RS_EXTRINSIC = re.compile(
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 #: CAM_B and CAM_C, an OAK-D's left and right camera.
 OAK_PAIR = (1, 2)
+#: Names of depthai's sockets, new and old.
+SOCKETS = {
+    **{f"CAM_{letter}": number for number, letter in enumerate("ABCDEFGHIJ")},
+    **{"RGB": 0, "CENTER": 0, "LEFT": 1, "RIGHT": 2},
+}
 Entries = dict[str, Any]
 Sockets = dict[int, Entries]
 
@@ -119,6 +124,11 @@ def read_realsense(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     return make_rig(left, right, np.linalg.inv(T), rectified=True)
 
 
+def _socket(value: Any) -> int:
+    """The number of a socket, by which older files call it, of its number or name; -1 for none."""
+    return SOCKETS.get(str(value).upper(), -1) if isinstance(value, str) else int(value)
+
+
 def _oak_camera(cameras: Sockets, socket: int, choice: CameraChoice, with_lens: bool) -> Camera:
     """The camera, at another resolution of the whole sensor where one is asked for."""
     entries = cameras[socket]
@@ -134,7 +144,7 @@ def _oak_links(cameras: Sockets, socket: int) -> dict[int, np.ndarray]:
     reached, T = {socket: np.eye(4)}, np.eye(4)
     while True:
         link, where = cameras[socket]["extrinsics"], f"extrinsics of socket {socket}"
-        socket = link["toCameraSocket"]
+        socket = _socket(link["toCameraSocket"])
         if socket not in cameras or socket in reached:
             return reached
         shift_cm = array_of([link["translation"][axis] for axis in "xyz"], (3,), where)
@@ -145,12 +155,15 @@ def _oak_links(cameras: Sockets, socket: int) -> dict[int, np.ndarray]:
 def read_oak(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """The cameras as they stand, or, by rectifying rotations, ``StereoDepth``'s, with the right one's K."""
     data = json.loads(texts[0])
-    cameras: Sockets = dict(data["cameraData"])  # pairs of a socket and its camera
+    found = data["cameraData"]  # pairs of a socket and its camera, or an object
+    pairs = found.items() if isinstance(found, dict) else found
+    cameras: Sockets = {_socket(key): each for key, each in pairs}
     stereo = data.get("stereoRectificationData") or {}
-    pair = stereo.get("leftCameraSocket", OAK_PAIR[0]), stereo.get("rightCameraSocket", OAK_PAIR[1])
-    pair = pair if min(pair) >= 0 else OAK_PAIR
-    left, right = two_cameras(choice, cameras, pair)
-    rectified = (left, right) == pair and bool(stereo.get("rectifiedRotationLeft"))
+    sides = zip(("leftCameraSocket", "rightCameraSocket"), OAK_PAIR, strict=True)
+    pair = [_socket(stereo.get(side, default)) for side, default in sides]
+    given = (pair[0], pair[1]) if min(pair) >= 0 else OAK_PAIR
+    left, right = two_cameras(choice, cameras, given)
+    rectified = (left, right) == given and bool(stereo.get("rectifiedRotationLeft"))
     first, second = (_oak_camera(cameras, socket, choice, not rectified) for socket in (left, right))
     from_left, from_right = _oak_links(cameras, left), _oak_links(cameras, right)
     common = next((socket for socket in from_left if socket in from_right), None)

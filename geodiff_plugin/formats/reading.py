@@ -18,6 +18,7 @@ from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Rig
 
 _JSON = r"\A\s*[{\[]"
+_NUMBER = r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?"
 #: Every format by name. The first that recognises a file reads it: formats that others contain come first.
 CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "middlebury": CalibrationFormat(
@@ -27,6 +28,9 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     # The number behind the colon keeps OpenCV's "P1: !!opencv-matrix" out.
     "kitti_projections": CalibrationFormat(
         "KITTI (P0: ...)", r"^\s*P[0-3]\s*:\s*[-+.\d]", stereo.read_kitti, uses_cameras=True),
+    "spring": CalibrationFormat(
+        "Spring's intrinsics.txt (fx fy cx cy a line)",
+        rf"\A(?:\s*{_NUMBER}(?:[ \t]+{_NUMBER}){{3}}[ \t]*(?:\n|\Z))+\s*\Z", stereo.read_spring),
     "foundation_stereo": CalibrationFormat(
         "K.txt of FoundationStereo (9 numbers, baseline)", r"\A(?i:[-+.\de\s,]|nan|inf)+\Z",
         stereo.read_foundation_stereo),
@@ -45,6 +49,18 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         "transforms.json of nerfstudio or instant-ngp (frames, transform_matrix)",
         _JSON + r'(?=[\s\S]*"frames")(?=[\s\S]*"transform_matrix")', transforms.read_nerf, by_image=True,
         as_stored=True),
+    "basalt": CalibrationFormat(
+        "basalt's calibration.json (T_imu_cam)", _JSON + r'(?=[\s\S]*"T_imu_cam")', robotics.read_basalt,
+        uses_cameras=True),
+    "cityscapes": CalibrationFormat(
+        "Cityscapes' camera.json (u0, v0)", _JSON + r'(?=[\s\S]*"u0")(?=[\s\S]*"extrinsic")',
+        stereo.read_cityscapes),
+    "matlab": CalibrationFormat(
+        "MATLAB's stereoParams by jsonencode (CameraParameters1)",
+        _JSON + r'(?=[\s\S]*"CameraParameters1")', storage.read_matlab),
+    "vins": CalibrationFormat(
+        "VINS-Fusion's configuration (cam0_calib, body_T_cam0)", r"^(cam0_calib|model_type)\s*:",
+        robotics.read_vins, beside=robotics.vins_cameras),
     "kalibr": CalibrationFormat(
         "Kalibr camchain.yaml (cam0)", r"^cam\d+:\s*(?:#.*)?$", robotics.read_kalibr, uses_cameras=True),
     "euroc": CalibrationFormat("pair of EuRoC sensor.yaml (T_BS)", r"^T_BS\s*:", robotics.read_euroc, (2,)),
@@ -63,6 +79,9 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "colmap": CalibrationFormat(
         "COLMAP model (cameras.txt and images.txt)", colmap.MARK, colmap.read_colmap, (2,), by_image=True,
         as_stored=True),
+    # Whatever JSON is left: which names it lacks is the best that can be said of it.
+    "named": CalibrationFormat(
+        "JSON or .npz of named matrices (K1, D1, K2, D2, R, T)", r"\A\s*\{", storage.read_opencv),
 }  # fmt: skip
 
 
@@ -73,7 +92,13 @@ def _texts(path: PathLike | Sequence[PathLike]) -> dict[Path, str]:
         bad_type("calibration", "a path, or a pair of paths (left, right)", path)
     if len(paths) == 1 and os.path.isdir(paths[0]):
         paths = colmap.model_files(Path(paths[0])) or paths
-    return {Path(file): colmap.calibration_text(file) for file in paths}
+    return {Path(file): _text(Path(file)) for file in paths}
+
+
+def _text(file: Path) -> str:
+    """The text of a calibration, of an archive of matrices as JSON."""
+    is_npz = file.suffix.lower() == ".npz" and file.is_file()
+    return storage.text_of_npz(file) if is_npz else colmap.calibration_text(file)
 
 
 def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
@@ -152,7 +177,12 @@ def read_calibration(
     if cameras is not None and not entry.uses_cameras:
         bad_value("cameras", "left out for a file of two cameras", cameras, "It chooses among more than two.")
     choice = CameraChoice(cameras, image_folder_hint, image_names, image_size)
-    with reading_whole(source, entry.summary):
+    complete = all(text.rstrip()[-1:] in ("}", "]", ">") for text in texts.values())
+    with reading_whole(source, entry.summary, complete):
+        if entry.beside is not None:
+            (file, text), *_ = texts.items()
+            more = [file.parent / Path(name).name for name in entry.beside(text)]
+            texts |= {each: _text(each) for each in more}
         rig = replace(entry.read(tuple(texts.values()), choice), source=source)
     for side, lens in zip(("left", "right"), rig.distortion, strict=True):
         if lens is not None and not distorted:

@@ -77,7 +77,8 @@ class CalibrationFormat:
     ``read`` makes the rig of the texts by ``make_rig``, and may raise whatever a missing entry raises. Files
     may be as many as ``file_counts`` says, hold more than two cameras (``uses_cameras``), or a pose in no
     known unit for each of many images (``by_image``), or cameras of the pixels as image files store them, not
-    as EXIF turns them (``as_stored``).
+    as EXIF turns them (``as_stored``). ``beside`` gives the names of files in the folder of the one that was
+    given, whose texts ``read`` takes too.
     """
 
     summary: str
@@ -87,11 +88,15 @@ class CalibrationFormat:
     uses_cameras: bool = False
     by_image: bool = False
     as_stored: bool = False
+    beside: Callable[[str], list[str]] | None = None
 
 
 @contextmanager
-def reading_whole(source: object, summary: str) -> Iterator[None]:
-    """Whatever is wrong in the files that are read inside becomes a sentence with their names."""
+def reading_whole(source: object, summary: str, complete: bool = False) -> Iterator[None]:
+    """Whatever is wrong in the files that are read inside becomes a sentence with their names.
+
+    Of files that are ``complete``, as JSON with its last brace, no one asks whether they were cut off.
+    """
     try:
         yield
     except InputFileError:
@@ -101,7 +106,8 @@ def reading_whole(source: object, summary: str) -> Iterator[None]:
     except Exception as error:  # of any kind that a damaged file leads to
         got = str(error) if isinstance(error, ValueError) else "other entries"
         got = f"no {error}" if isinstance(error, KeyError) else got
-        bad_value(str(source), f"a whole {summary}", got, "Is the file cut off?")
+        cure = "Is it of another program, or of one camera?" if complete else "Is the file cut off?"
+        bad_value(str(source), f"a whole {summary}", got, cure)
 
 
 def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:

@@ -1,10 +1,17 @@
-"""Calibrations of robotics: Kalibr, EuRoC, ROS, ORB-SLAM."""
+"""Calibrations of robotics: Kalibr and OpenVINS, EuRoC, ROS, ORB-SLAM, basalt, VINS-Fusion.
+
+Source: ``config/euroc_mav/kalibr_imucam_chain.yaml`` of rpng/open_vins; ``data/euroc_ds_calib.json`` of
+VladyslavUsenko/basalt; ``config/euroc`` and ``vins_estimator/src/estimator/parameters.cpp`` of
+HKUST-Aerial-Robotics/VINS-Fusion.
+"""
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.rigs import (
@@ -13,6 +20,7 @@ from geodiff_plugin.formats.rigs import (
     array_of,
     intrinsics,
     make_rig,
+    pose_of,
     projected,
     rigid,
     transform,
@@ -40,14 +48,94 @@ def _pinhole(entries: Entries, coefficients: str) -> Camera:
 
 
 def read_kalibr(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """Two cameras of a chain, cam0 and cam1 unless chosen; ``T_cn_cnm1`` takes points to a camera."""
+    """Two cameras of a chain, cam0 and cam1 unless chosen, in metres."""
     chain = read_yaml(texts[0])
     pair = two_cameras(choice, [n for n in range(len(chain)) if f"cam{n}" in chain], (0, 1))
-    from_first = [np.eye(4)]
-    for n in range(1, max(pair) + 1):
-        from_first.append(rigid(chain[f"cam{n}"]["T_cn_cnm1"], f"T_cn_cnm1 of cam{n}") @ from_first[-1])
     left, right = (_pinhole(chain[f"cam{n}"], "distortion_coeffs") for n in pair)
-    return make_rig(left, right, from_first[pair[0]] @ np.linalg.inv(from_first[pair[1]]))
+    poses = _poses_of_chain(chain, max(pair) + 1)
+    return make_rig(left, right, np.linalg.inv(poses[pair[0]]) @ poses[pair[1]])
+
+
+def _poses_of_chain(chain: Entries, count: int) -> list[np.ndarray]:
+    """The poses of the first cameras in one frame, ``(4, 4)`` each.
+
+    ``T_cn_cnm1`` takes points to a camera from the one before. OpenVINS has none, but every camera's pose in
+    the frame of the IMU, ``T_imu_cam``, or that of its inverse, ``T_cam_imu``, as Kalibr's own files.
+    """
+    cameras = [chain[f"cam{n}"] for n in range(count)]
+    if not all("T_cn_cnm1" in camera for camera in cameras[1:]):
+        if all("T_imu_cam" in camera for camera in cameras):
+            return [rigid(camera["T_imu_cam"], f"T_imu_cam of cam{n}") for n, camera in enumerate(cameras)]
+        if all("T_cam_imu" in camera for camera in cameras):
+            from_imu = [camera["T_cam_imu"] for camera in cameras]
+            return [np.linalg.inv(rigid(T, f"T_cam_imu of cam{n}")) for n, T in enumerate(from_imu)]
+    poses = [np.eye(4)]
+    for n, camera in enumerate(cameras[1:], 1):
+        poses.append(poses[-1] @ np.linalg.inv(rigid(camera["T_cn_cnm1"], f"T_cn_cnm1 of cam{n}")))
+    return poses
+
+
+#: basalt's camera types by OpenCV's model, and the order of their coefficients.
+BASALT_LENSES = {
+    "pinhole": ("opencv", ()),
+    "pinhole-radtan8": ("opencv", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "kb4": ("fisheye", ("k1", "k2", "k3", "k4")),
+}
+
+
+def read_basalt(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """Basalt's ``calibration.json``: poses of the cameras in the frame of the IMU, in metres."""
+    data = json.loads(texts[0])
+    data = data.get("value0", data)
+    pair = two_cameras(choice, range(len(data["T_imu_cam"])), (0, 1))
+    poses = []
+    for n in pair:
+        x, y, z, w = array_of([data["T_imu_cam"][n][f"q{axis}"] for axis in "xyzw"], (4,), "a rotation")
+        turn = Rotation.from_quat([x, y, z, w])
+        poses.append(pose_of(turn, [data["T_imu_cam"][n][f"p{axis}"] for axis in "xyz"]))
+    left, right = (_basalt_camera(data["intrinsics"][n], data["resolution"][n]) for n in pair)
+    return make_rig(left, right, np.linalg.inv(poses[0]) @ poses[1])
+
+
+def _basalt_camera(entries: Entries, size: Any) -> Camera:
+    kind, values = entries["camera_type"], entries["intrinsics"]
+    if kind not in BASALT_LENSES:
+        cure = "Calibrate with basalt_calibrate --cam-types kb4 kb4."
+        bad_value("camera_type", f"one of {', '.join(BASALT_LENSES)}", kind, cure)
+    model, names = BASALT_LENSES[kind]
+    K = intrinsics(*(values[key] for key in ("fx", "fy", "cx", "cy")))
+    return Camera(K, size, [values[name] for name in names], model)
+
+
+#: VINS-Fusion's camera types: OpenCV's model, entries with K and the lens, in its order.
+VINS_LENSES = {
+    "PINHOLE": ("opencv", ("fx", "fy", "cx", "cy"), ("k1", "k2", "p1", "p2")),
+    "KANNALA_BRANDT": ("fisheye", ("mu", "mv", "u0", "v0"), ("k2", "k3", "k4", "k5")),
+}
+
+
+def vins_cameras(text: str) -> list[str]:
+    """The names of the files of both cameras, which lie beside a configuration."""
+    return [str(read_yaml(text)[f"cam{n}_calib"]) for n in (0, 1)]
+
+
+def read_vins(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """VINS-Fusion's configuration and the two files that it names; ``body_T_cam`` are poses in metres."""
+    config, *files = (read_yaml(text) for text in texts)
+    poses = [rigid(config[f"body_T_cam{n}"]["data"], f"body_T_cam{n}") for n in (0, 1)]
+    left, right = map(_vins_camera, files)
+    return make_rig(left, right, np.linalg.inv(poses[0]) @ poses[1])
+
+
+def _vins_camera(entries: Entries) -> Camera:
+    kind = str(entries["model_type"]).upper()
+    if kind not in VINS_LENSES:
+        cure = "Calibrate with --camera-model pinhole or kannala-brandt, or give Kalibr's camchain.yaml."
+        bad_value("model_type", f"one of {', '.join(VINS_LENSES)}", kind, cure)
+    model, of_K, of_lens = VINS_LENSES[kind]
+    values = {**(entries.get("distortion_parameters") or {}), **entries["projection_parameters"]}
+    size = entries["image_width"], entries["image_height"]
+    return Camera(intrinsics(*(values[key] for key in of_K)), size, [values[key] for key in of_lens], model)
 
 
 def euroc_camera(sensor: Entries) -> Camera:

@@ -31,6 +31,8 @@ PROJECTION = re.compile(r"(P_rect_|P)(\d+)")
 PAIRS = ((0, 1), (2, 3))
 #: Folder names of the benchmarks: image_2 and image_02, and colored_0 of KITTI 2012.
 FOLDER = re.compile(r"(image|colored)_0?([0-3])(?!\d)")
+#: What the baseline is called, in metres.
+BASELINES = ("baseline_meters", "baseline_m", "baseline")
 #: Metres between the cameras of Spring, which its files do not say.
 SPRING_BASELINE_M = 0.065
 
@@ -70,7 +72,28 @@ def read_stereodemo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     size = data.get("width"), data.get("height")
     columns = ("cx", "cx") if "cx" in data else ("cx0", "cx1")
     left, right = (Camera(intrinsics(data["fx"], data["fy"], data[cx], data["cy"]), size) for cx in columns)
-    return make_rig(left, right, data["baseline_meters"])
+    named = next((key for key in BASELINES if key in data), BASELINES[0])
+    return make_rig(left, right, data[named])
+
+
+def read_cityscapes(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """Cityscapes' ``camera.json``, of rectified images of one K; the pose in the vehicle is left out."""
+    data = json.loads(texts[0])
+    values = data["intrinsic"]
+    camera = Camera(intrinsics(*(values[key] for key in ("fx", "fy", "u0", "v0"))))
+    return make_rig(camera, camera, data["extrinsic"]["baseline"], rectified=True)
+
+
+def read_spring(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """Spring's ``cam_data/intrinsics.txt``: a line fx fy cx cy a frame, the first one of number 1."""
+    rows = array_of(texts[0].split(), (-1,), "fx fy cx cy").reshape(-1, 4)
+    numbers = re.findall(r"\d+", str(choice.image_names[0])) if choice.image_names else []
+    row = int(numbers[-1]) - 1 if numbers else 0
+    if (rows != rows[0]).any() and not 0 <= row < len(rows):
+        cure = "Spring's images are frame_left_0001.png and so on."
+        bad_value("the left image", f"named by its number, 1 to {len(rows)}", choice.image_names, cure)
+    camera = Camera(intrinsics(*rows[row if row < len(rows) else 0]))
+    return make_rig(camera, camera, SPRING_BASELINE_M, rectified=True)
 
 
 def _kitti_cameras(available: Collection[int], choice: CameraChoice) -> tuple[int, int]:

@@ -5,7 +5,10 @@ OpenCV's own reader is not used: a damaged file can corrupt its memory, and cali
 
 from __future__ import annotations
 
+import json
 import re
+import zipfile
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -14,16 +17,51 @@ import yaml
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.files import parse_xml
-from geodiff_plugin.formats.rigs import Camera, CameraChoice, make_rig, projected, transform
+from geodiff_plugin.formats.rigs import (
+    Camera,
+    CameraChoice,
+    array_of,
+    make_rig,
+    projected,
+    rigid,
+    transform,
+)
 from geodiff_plugin.types import Rig
 
 Entries = dict[str, Any]
 #: OpenCV's head of a YAML file, which YAML itself does not know; files written by hand copy it.
 OPENCV_HEAD = re.compile(r"\A\s*%YAML:[^\n]*")
+#: Dumps of programs that share a list have a few.
+MOST_ALIASES = 32
+#: Numbers that an array of an .npz may have: those of cameras have 16 at most, lists of lenses 14.
+MOST_NUMBERS = 64
+#: Bytes before the numbers of an array in an .npz, at most.
+NPY_HEAD = 256
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML as OpenCV writes it: its matrices, since OpenCV 5 of one axis too, are mappings like others."""
+    """YAML as OpenCV writes it: its matrices, since OpenCV 5 of one axis too, are mappings like others.
+
+    An alias may stand for a part of the file without aliases: those of aliases grow a kilobyte to gigabytes.
+    """
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._aliases, self._holding = 0, set[int]()  # how many, and the nodes that hold any
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """The node, or that of an alias, which is refused where it holds others or is one of too many."""
+        is_alias, before = self.check_event(yaml.events.AliasEvent), self._aliases
+        node = super().compose_node(parent, index)
+        if is_alias:
+            self._aliases += 1
+            # A node without an end stands for itself, inside of itself.
+            if self._aliases > MOST_ALIASES or id(node) in self._holding or node.end_mark is None:
+                expected = f"YAML with {MOST_ALIASES} aliases at most, none of which holds others"
+                bad_value("the file", expected, "more", "Write out what its aliases (*name) stand for.")
+        elif self._aliases > before:
+            self._holding.add(id(node))
+        return node
 
 
 for _kind in ("opencv-matrix", "opencv-nd-matrix"):
@@ -44,12 +82,19 @@ def read_storage(text: str) -> Entries:
     """The entries of an OpenCV file by key in small letters: numbers as flat arrays, and strings."""
     # JSON is YAML; older versions of OpenCV write 1. and .Nan into it, which JSON itself does not know.
     content = _of_element(parse_xml(text)) if "<opencv_storage" in text else read_yaml(text)
-    maps = [value for value in content.values() if isinstance(value, dict) and "data" not in value]
+    maps = {key: value for key, value in content.items() if isinstance(value, dict) and "data" not in value}
+    below = [(_below(str(key), name), value) for key, each in maps.items() for name, value in each.items()]
     entries: Entries = {}
-    for key, value in [item for each in (*maps, content) for item in each.items()]:
+    for key, value in [*below, *content.items()]:
         numbers = _numbers(value["data"] if isinstance(value, dict) and "data" in value else value)
         entries[str(key).lower()] = value if numbers is None else numbers
     return entries
+
+
+def _below(key: str, name: Any) -> str:
+    """The name of an entry below another, with the side of its camera where the outer name says one."""
+    sides = re.findall("left|right", key.lower())
+    return f"{sides[0]}.{name}" if len(sides) == 1 else str(name)
 
 
 def _of_element(node: ElementTree.Element) -> Any:
@@ -60,8 +105,10 @@ def _of_element(node: ElementTree.Element) -> Any:
 
 
 def _numbers(value: Any) -> np.ndarray | None:
-    """A number or a flat list of numbers, some of which may be text; ``None`` for other things."""
+    """A number, or the numbers of a list or of lists in it, some of which may be text; else ``None``."""
     words = value if isinstance(value, list) else [value]
+    while any(isinstance(word, list) for word in words):
+        words = [part for word in words for part in (word if isinstance(word, list) else [word])]
     try:  # OpenCV writes .Nan and .Inf, which Python reads without the dot
         words = [re.sub(r"\.(nan|inf)", r"\1", w.lower()) if isinstance(w, str) else w for w in words]
         return None if any(isinstance(w, bool) for w in words) else np.array([float(w) for w in words])
@@ -86,6 +133,7 @@ NAMES = {
     **{f"{name}2": _of(words, "2", "right") for name, words in WORDS.items()},
     "R": "r|rot|rotation|rotationmatrix",
     "T": "t|trans|translation|translationmatrix|translationvector",
+    "E": "e|pose",
     "image_size": "imagesize|imgres|imgsize|size",
     "image_width": "imagewidth|leftwidth",
     "image_height": "imageheight|leftheight",
@@ -129,11 +177,62 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     size = next((pair for pair in (named.get("image_size", sides), sides) if pair.size == 2), None)
     if named.keys() >= {"P1", "P2"}:
         return projected(named["P1"], named["P2"], size, size)
-    missing = [name for name in ("M1", "M2", "R", "T") if name not in named]
+    posed = "E" in named and named["E"].size == 16 and "R" not in named  # of 9 it is the essential matrix
+    missing = [name for name in ("M1", "M2", *(() if posed else ("R", "T"))) if name not in named]
     if missing:
-        expected = "an OpenCV calibration with P1, P2, or with M1, M2, R, T"
+        expected = "a calibration with P1, P2, or with M1, M2, R, T"
         cure = "Where intrinsics and extrinsics are two files, give both; rename what has other names."
         bad_value("the file", expected, f"no {', '.join(missing)}", cure)
     lenses = zip(("M1", "M2"), _lenses(arrays, named), strict=True)
     left, right = (Camera(named[name], size, lens) for name, lens in lenses)
+    if posed:
+        return make_rig(left, right, rigid(named["E"], "E"))
     return make_rig(left, right, np.linalg.inv(transform(named["R"], named["T"], "R, T")))
+
+
+def text_of_npz(path: Path) -> str:
+    """The small arrays of an ``.npz`` as JSON, for ``read_opencv``; nothing is unpickled."""
+    matrices: Entries = {}
+    try:
+        with zipfile.ZipFile(path) as archive, np.load(path, allow_pickle=False) as arrays:
+            small = [each for each in archive.infolist() if each.file_size <= 8 * MOST_NUMBERS + NPY_HEAD]
+            for name in (each.filename.removesuffix(".npy") for each in small):
+                value = arrays[name]
+                if value.dtype.kind in "fiu" and value.size <= MOST_NUMBERS:
+                    matrices[name] = value.tolist()
+    except Exception as error:  # of any kind that a damaged archive leads to
+        bad_value("calibration", "a whole .npz of matrices", f"{path} ({error})", "Is it cut off?")
+    return json.dumps(matrices)
+
+
+#: What MATLAB calls its units, and how many of them a metre has; millimetres are its default.
+MATLAB_UNITS = {"mm": 1e3, "millimeters": 1e3, "cm": 1e2, "centimeters": 1e2, "m": 1.0, "meters": 1.0}
+
+
+def _matlab_camera(entries: Entries) -> Camera:
+    """A camera of ``cameraParameters``: pixels count from 1, and ``IntrinsicMatrix`` is transposed."""
+    K = array_of(entries.get("K") or entries["IntrinsicMatrix"], (3, 3), "IntrinsicMatrix")
+    K = K.T if K[2, :2].any() else K
+    K[:2, 2] -= 1
+    radial = [*np.ravel(entries["RadialDistortion"]), 0.0][:3]
+    p1, p2 = np.ravel(entries.get("TangentialDistortion") or (0.0, 0.0))
+    size = entries.get("ImageSize") or (None, None)  # rows, columns
+    return Camera(K, (size[1], size[0]), (radial[0], radial[1], p1, p2, radial[2]))
+
+
+def read_matlab(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """MATLAB's ``stereoParameters`` by ``jsonencode``, its rotation transposed as it multiplies rows.
+
+    Source: its documentation; ``RotationOfCamera2`` is ``PoseCamera2.R`` transposed, which newer files have.
+    """
+    data = json.loads(texts[0])
+    left, right = (_matlab_camera(data[f"CameraParameters{n}"]) for n in (1, 2))
+    if "PoseCamera2" in data:
+        R, t = np.array(data["PoseCamera2"]["R"], float), data["PoseCamera2"]["Translation"]
+    else:
+        R, t = np.array(data["RotationOfCamera2"], float).T, data["TranslationOfCamera2"]
+    unit = str(data["CameraParameters1"].get("WorldUnits") or "mm").lower()
+    if unit not in MATLAB_UNITS:
+        bad_value("WorldUnits", f"one of {', '.join(MATLAB_UNITS)}", unit)
+    shift_m = array_of(t, (3,), "TranslationOfCamera2") / MATLAB_UNITS[unit]
+    return make_rig(left, right, np.linalg.inv(transform(R, shift_m, "RotationOfCamera2")))

@@ -88,6 +88,120 @@ def kalibr_fisheye(rig: Drawn) -> tuple[str, ...]:
     return kalibr(rig, "equidistant")
 
 
+def kalibr_openvins(rig: Drawn, key: str = "T_imu_cam") -> tuple[str, ...]:
+    """OpenVINS' chain: no camera says where it is beside another, each where it is beside the IMU."""
+    chain = yaml.safe_load(kalibr(rig)[0])
+    del chain["cam1"]["T_cn_cnm1"]
+    for n, T in enumerate(rig.worlds):
+        chain[f"cam{n}"][key] = (np.linalg.inv(T) if key == "T_imu_cam" else T).tolist()
+    return ("%YAML:1.0\n\n" + yaml.safe_dump(chain),)
+
+
+def kalibr_cam_imu(rig: Drawn) -> tuple[str, ...]:
+    return kalibr_openvins(rig, "T_cam_imu")
+
+
+def basalt(rig: Drawn, kind: str = "pinhole-radtan8", keys: str = "k1 k2 p1 p2") -> tuple[str, ...]:
+    poses, cameras = [], []
+    for n, T in enumerate(rig.worlds):
+        E = np.linalg.inv(T)
+        quaternion = zip(
+            ("qx", "qy", "qz", "qw"), Rotation.from_matrix(E[:3, :3]).as_quat().tolist(), strict=True
+        )
+        poses.append(dict(zip(("px", "py", "pz"), E[:3, 3].tolist(), strict=True)) | dict(quaternion))
+        values = dict(zip(("fx", "fy", "cx", "cy"), rig.numbers(n), strict=True))
+        values |= dict.fromkeys(("k3", "k4", "k5", "k6"), 0.0) | dict(
+            zip(keys.split(), rig.lenses[n], strict=True)
+        )
+        cameras.append({"camera_type": kind, "intrinsics": values})
+    entries = {"T_imu_cam": poses, "intrinsics": cameras, "resolution": [list(rig.size)] * 2, "vignette": []}
+    return (json.dumps({"value0": entries}, indent=4),)
+
+
+def basalt_fisheye(rig: Drawn) -> tuple[str, ...]:
+    return basalt(rig, "kb4", "k1 k2 k3 k4")
+
+
+def vins(rig: Drawn, kind: str = "PINHOLE") -> tuple[str, ...]:
+    """A configuration, and the two files that it names beside itself."""
+    K_names, lens_names = {
+        "PINHOLE": ("fx fy cx cy", "k1 k2 p1 p2"),
+        "KANNALA_BRANDT": ("mu mv u0 v0", "k2 k3 k4 k5"),
+    }[kind]
+    config = storage(**{f"body_T_cam{n}": np.linalg.inv(T) for n, T in enumerate(rig.worlds)})
+    texts = [config + 'imu: 1\nnum_of_cam: 2\ncam0_calib: "file1.dat"\ncam1_calib: "file2.dat"\n']
+    for n in range(2):
+        K = dict(zip(K_names.split(), rig.numbers(n), strict=True))
+        lens = dict(zip(lens_names.split(), rig.lenses[n], strict=True))
+        head = {"model_type": kind, "image_width": rig.size[0], "image_height": rig.size[1]}
+        parts = {"distortion_parameters": lens, "projection_parameters": K}
+        if kind != "PINHOLE":
+            parts = {"projection_parameters": lens | K}
+        texts.append("%YAML:1.0\n---\n" + yaml.safe_dump(head | parts))
+    return tuple(texts)
+
+
+def vins_fisheye(rig: Drawn) -> tuple[str, ...]:
+    return vins(rig, "KANNALA_BRANDT")
+
+
+def matlab(rig: Drawn) -> tuple[str, ...]:
+    """jsonencode(toStruct(stereoParams)): matrices that multiply rows, pixels from 1, millimetres."""
+    entries: dict[str, Any] = {}
+    for n in range(2):
+        K = rig.K[n] + [[0, 0, 1], [0, 0, 1], [0, 0, 0]]
+        k1, k2, p1, p2 = rig.lenses[n]
+        camera = {"IntrinsicMatrix": K.T.tolist(), "RadialDistortion": [k1, k2], "WorldUnits": "mm"}
+        camera |= {"TangentialDistortion": [p1, p2], "ImageSize": [rig.size[1], rig.size[0]]}
+        entries[f"CameraParameters{n + 1}"] = camera
+    entries["RotationOfCamera2"] = rig.T[:3, :3].T.tolist()
+    entries["TranslationOfCamera2"] = (1000 * rig.T[:3, 3]).tolist()
+    return (json.dumps(entries),)
+
+
+def matlab_pose(rig: Drawn) -> tuple[str, ...]:
+    """Since R2022b: matrices that multiply columns."""
+    entries = json.loads(matlab(rig)[0])
+    entries["PoseCamera2"] = {"R": rig.T[:3, :3].tolist(), "Translation": entries["TranslationOfCamera2"]}
+    for n in range(2):
+        camera = entries[f"CameraParameters{n + 1}"]
+        camera["K"] = np.transpose(camera.pop("IntrinsicMatrix")).tolist()
+    return (json.dumps(entries),)
+
+
+def named(rig: Drawn) -> tuple[str, ...]:
+    """Plain JSON of lists of lists, by the names of OpenCV's tutorials."""
+    cameras = {"camera_matrix_left": rig.K[0], "camera_matrix_right": rig.K[1], "R": rig.T[:3, :3]}
+    entries = {name: matrix.tolist() for name, matrix in cameras.items()} | {"T": rig.T[:3, 3:].tolist()}
+    entries |= {"dist_left": rig.lenses[0], "dist_right": [rig.lenses[1]], "image_size": list(rig.size)}
+    return (json.dumps(entries),)
+
+
+def named_by_side(rig: Drawn) -> tuple[str, ...]:
+    """An object a camera, and the pose as our own options take it."""
+    sides = {
+        side: {"K": rig.K[n].tolist(), "dist": rig.lenses[n]} for n, side in enumerate(("left", "right"))
+    }
+    return (json.dumps(sides | {"E": np.linalg.inv(rig.T).tolist(), "image_size": list(rig.size)}),)
+
+
+def cityscapes(rig: Drawn) -> tuple[str, ...]:
+    intrinsic = dict(zip(("fx", "fy", "u0", "v0"), rig.numbers(0), strict=True))
+    extrinsic = {
+        "baseline": float(-rig.T[0, 3]),
+        "pitch": 0.03,
+        "roll": 0.0,
+        "x": 1.7,
+        "y": 0.1,
+        "yaw": -0.01,
+    }
+    return (json.dumps({"extrinsic": extrinsic, "intrinsic": intrinsic}),)
+
+
+def spring(rig: Drawn) -> tuple[str, ...]:
+    return (f"{words(rig.numbers(0))}\n{words(rig.numbers(0))}\n",)
+
+
 def euroc(rig: Drawn) -> tuple[str, ...]:
     texts = []
     for n, T in enumerate(rig.worlds):
@@ -283,13 +397,14 @@ def ros_echo(rig: Drawn) -> tuple[str, ...]:
 #: begins with that of the format.
 ANY_POSE = (
     *(opencv, kalibr, euroc, orb_slam, mvsnet, zed, realsense, realsense_printed, oak, colmap, nerf),
-    *(kalibr_fisheye, orb_slam_fisheye),
+    *(kalibr_fisheye, orb_slam_fisheye, kalibr_openvins, kalibr_cam_imu, basalt, basalt_fisheye),
+    *(vins, vins_fisheye, matlab, matlab_pose, named, named_by_side),
 )
 RECTIFIED = (
     *(middlebury, middlebury_blanks, kitti_cam_to_cam, kitti_projections, booster, stereodemo, ros, ros_echo),
     opencv_projections,
 )
-ONE_CAMERA = (foundation_stereo, orb_slam_rectified)
+ONE_CAMERA = (foundation_stereo, orb_slam_rectified, cityscapes, spring)
 
 #: A rig of 0.12 m in every format, by the name of the function.
 K = np.array([[700.0, 0, 300], [0, 700.0, 200], [0, 0, 1]])
@@ -301,7 +416,8 @@ SAMPLES = {w.__name__: w(RIG) for w in ANY_POSE + RECTIFIED + ONE_CAMERA if "fis
 def choice(sample: str, baseline_m: float = 0.12) -> dict[str, Any]:
     """What ``read_calibration`` needs beside the text."""
     by_name = {"image_names": NAMES, "baseline_m": baseline_m}
-    return {"zed": {"image_size": (1280, 720)}, "colmap": by_name, "nerf": by_name}.get(sample, {})
+    needed = {"zed": {"image_size": (1280, 720)}, "colmap": by_name, "nerf": by_name}
+    return (needed | {"spring": {"baseline_m": baseline_m}}).get(sample, {})
 
 
 def written(folder: Path, texts: tuple[str, ...]) -> Path | tuple[Path, ...]:
@@ -309,7 +425,7 @@ def written(folder: Path, texts: tuple[str, ...]) -> Path | tuple[Path, ...]:
     paths = tuple(folder / f"file{i}.dat" for i in range(len(texts)))
     for path, text in zip(paths, texts, strict=True):
         path.write_text(text)
-    return paths[0] if len(paths) == 1 else paths
+    return paths[0] if len(paths) == 1 or "cam0_calib" in texts[0] else paths
 
 
 def read_texts(folder: Path, *texts: str, **given: Any) -> Rig:

@@ -1,5 +1,6 @@
 """Every entry of CALIBRATION_FORMATS: any rig is read as it was written, and bad files get a sentence."""
 
+import json
 import re
 
 import numpy as np
@@ -77,7 +78,7 @@ def test_a_sample_is_recognised_as_its_own_format_and_read_whatever_its_line_end
     plain = read_calibration(paths, **choice(sample))
     assert pytest.approx(np.linalg.inv(of.RIG.T), abs=1e-9) == plain.E and "file0.dat" in plain.source
     assert plain.K_left.dtype == plain.K_right.dtype == plain.E.dtype == np.float64
-    for path, text in zip(paths if isinstance(paths, tuple) else (paths,), texts, strict=True):
+    for path, text in zip(sorted(tmp_path.iterdir()), texts, strict=True):
         path.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
     again = read_calibration(paths, **choice(sample))
     np.testing.assert_array_equal(again.K_right, plain.K_right)
@@ -138,6 +139,13 @@ REFUSALS = [
     ("all:colmap", "OPENCV 640", "FISHY 640", "model of camera 1 must be one of SIMPLE_PINH.*Undistort"),
     ("colmap", " 2 rig/right", " 7 rig/right", "with camera 7; got only 1, 2"),
     ("colmap", "\n3 1.0", "\n3 0.0", "must be a whole COLMAP model"),
+    ("kalibr_openvins", "T_imu_cam", "T_wheel_cam", "no 'T_cn_cnm1'"),
+    ("basalt", "pinhole-radtan8", "ds", "camera_type must be one of .*got ds. Calibrate with .*kb4"),
+    ("vins", "PINHOLE", "MEI", "model_type must be one of PINHOLE, KANNALA_BRANDT; got MEI"),
+    ("matlab", '"mm"', '"furlongs"', "WorldUnits must be one of .*got furlongs"),
+    ("matlab", '"TranslationOfCamera2"', '"Shift"', "no 'TranslationOfCamera2'. Is it of another program"),
+    ("cityscapes", '"baseline"', '"base"', "got no 'baseline'. Is it of another program"),
+    ("named", '"camera_matrix_left"', '"left_lens"', "P1, P2, or with M1, M2, R, T; got no M1"),
     ("nerf", '"k1"', '"k4": 0.1, "k1"', "k4 must be zero for OPENCV; got .0.1."),
 ]  # fmt: skip
 
@@ -202,3 +210,48 @@ def test_parameters_of_a_data_sheet_are_checked(at, value, name):
     arguments[at] = value
     with pytest.raises(ValueError, match=name):
         rig_from_parameters(*arguments)
+
+
+def test_an_archive_of_matrices_is_read_as_json_is(tmp_path):
+    matrices = {"K1": of.K, "K2": of.K, "D1": np.zeros(5), "D2": np.zeros(5), "R": np.eye(3)}
+    np.savez(tmp_path / "c.npz", T=[-0.12, 0, 0], images=np.zeros((400, 400)), **matrices)
+    rig = read_calibration(tmp_path / "c.npz")
+    np.testing.assert_allclose(rig.E, np.linalg.inv(of.RIG.T))
+    np.savez(tmp_path / "pickled.npz", K1=np.array([{}], dtype=object))
+    with pytest.raises(InputError, match="whole .npz of matrices"):
+        read_calibration(tmp_path / "pickled.npz")
+
+
+def test_spring_chooses_a_line_by_the_number_of_the_image(tmp_path):
+    text = "2000 2000 960 540\n2100 2100 960 540\n"
+    names = ("frame_left_0002.png", "frame_right_0002.png")
+    assert of.read_texts(tmp_path, text, image_names=names).K_left[0, 0] == 2100
+    assert of.read_texts(tmp_path, text, image_names=names).E[0, 3] == 0.065
+    with pytest.raises(InputError, match="named by its number, 1 to 2"):
+        of.read_texts(tmp_path, text, image_names=("frame_left_0003.png", "frame_right_0003.png"))
+
+
+def test_sockets_of_an_oak_may_have_names(tmp_path):
+    text = SAMPLES["oak"][0]
+    data = json.loads(text)
+    letters = {0: "CAM_A", 1: "CAM_B", 2: "CAM_C", -1: "AUTO"}
+    for _, camera in data["cameraData"]:
+        camera["extrinsics"]["toCameraSocket"] = letters[camera["extrinsics"]["toCameraSocket"]]
+    data["cameraData"] = {letters[socket]: camera for socket, camera in data["cameraData"]}
+    rig = of.read_texts(tmp_path, json.dumps(data))
+    np.testing.assert_allclose(rig.E, of.read_texts(tmp_path, text).E)
+
+
+BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize("text", [BOMB, "a: &a [1, [2, *a]]\n", "a: &a [1]\nb: [" + "*a, " * 40 + "*a]\n"])
+def test_aliases_that_grow_without_end_are_refused(text, tmp_path):
+    """A kilobyte of them stood for 10 GB; a few of plain lists, as dumps of programs have, are read."""
+    chain = SAMPLES["kalibr"][0]
+    with pytest.raises(InputError, match="aliases at most.*Write out what its aliases"):
+        of.read_texts(tmp_path, text + chain)
+    shared = chain.replace("cam_overlaps:", "shared: &s [0, 1]\n  again: *s\n  cam_overlaps:", 1)
+    assert of.read_texts(tmp_path, shared).E[0, 3] == pytest.approx(0.12)
