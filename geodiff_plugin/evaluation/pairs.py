@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import statistics
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -15,7 +16,7 @@ from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.config import DEFAULT, value_of
 from geodiff_plugin.evaluation import experiment, tables
 from geodiff_plugin.evaluation.baselines import find_method
-from geodiff_plugin.evaluation.datasets import SampleRef, select
+from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, select
 from geodiff_plugin.evaluation.experiment import Page
 from geodiff_plugin.evaluation.options import PairsOptions
 from geodiff_plugin.evaluation.tables import Table, cell, count_of_pairs, mean_cell, pairs_of
@@ -234,6 +235,19 @@ def _method_records(refs: Sequence[SampleRef], method: str, options: PairsOption
     return experiment.measure_cells(pair_cells(refs, (method,), options), options) or []
 
 
+def _import_all(modules: Sequence[str]) -> None:
+    for module in modules:
+        importlib.import_module(module)
+
+
+def fresh_process() -> ProcessPoolExecutor:
+    """One new process, which knows every registered data set."""
+    # A file that was run is read again by a new process, but not what `python -m` ran.
+    modules = sorted({dataset.load.__module__ for dataset in DATASETS.values()} - {"__main__"})
+    context = get_context("spawn")
+    return ProcessPoolExecutor(1, mp_context=context, initializer=_import_all, initargs=(modules,))
+
+
 def run_cost(name: str, options: PairsOptions) -> Page:
     """Measure ``COST_METHODS`` and further ones, and write the table; records go to ``out/cost``."""
     if this_process().count > 1:
@@ -245,8 +259,8 @@ def run_cost(name: str, options: PairsOptions) -> Page:
         prior = find_method(method).prior or options.prior
         taken[prior] = options.steps or _steps_of(prior)
         # What one method frees stays with the allocator, where the next would find it at no cost.
-        with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as fresh_process:
-            job = fresh_process.submit(_method_records, refs, method, replace(alone, steps=taken[prior]))
+        with fresh_process() as process:
+            job = process.submit(_method_records, refs, method, replace(alone, steps=taken[prior]))
             records += job.result()
     steps = [f"{count or 'its own number'} with {prior}" for prior, count in taken.items()]
     remarks = (*remarks_on(records, options), f"Denoising steps of each: {', '.join(steps)}.")

@@ -59,5 +59,5 @@ lab_app = new_group(
     outermost=True,
 )
 
-if __name__ == "__main__":  # `cost` starts processes, which read this file again
+if __name__ == "__main__":
     lab_app(prog_name=PROGRAM)

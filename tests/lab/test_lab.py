@@ -1,11 +1,15 @@
 """``python -m tests.lab``: the commands of ``geodiff eval`` on rendered pairs, and the laboratories."""
 
 import json
+import os
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from geodiff_plugin.cli.eval import eval_app
+from geodiff_plugin.evaluation.datasets import find_pairs, load
+from geodiff_plugin.evaluation.pairs import fresh_process
 from tests.lab.__main__ import LABORATORIES, PROGRAM, lab_app
 
 
@@ -18,6 +22,14 @@ def test_pages_name_the_command_that_made_them(tmp_path):
     done = typed(*words, "--out", tmp_path)
     assert done.exit_code == 0 and f"{PROGRAM} {' '.join(words)}" in done.stdout
     assert json.loads((tmp_path / "table.json").read_text())["command"] == f"{PROGRAM} {' '.join(words)}"
+
+
+def test_a_process_of_its_own_knows_the_rendered_pairs():
+    (ref,) = find_pairs("synthetic:1@64x48")
+    with fresh_process() as process:
+        sample = process.submit(load, ref).result()
+        assert process.submit(os.getpid).result() != os.getpid()
+    assert np.array_equal(sample.left, load(ref).left)
 
 
 @pytest.mark.parametrize("name", LABORATORIES)
