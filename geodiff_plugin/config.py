@@ -155,7 +155,7 @@ class GuidanceConfig:
             fit to the points without a right view); the argmin over g_s (S7.3); or the nearest and the
             farthest point (Marigold-DC).
         positive: how raw scale and shift become positive (Eq. 13); `square` also clips the map to [0, 1].
-        g_s_range: candidates of the one-number search.
+        g_s_range: candidates of the one-number search; the paper says "a predefined depth range" (S7.3).
         g_s_candidates: the number of these candidates.
         reject_reflections: regions of matches behind the first decoded estimate count as reflections.
         correct: the decoded map is fitted to its matches and points and the change is encoded, before the
@@ -163,6 +163,7 @@ class GuidanceConfig:
         corrections: upper bound on the number of steps (or rounds of a one-step prior) that are corrected:
             the last, and the others spread over the second half of the schedule where they fit.
         even_ensemble: median of an even number of members: mean of the middle two, or the lower of them.
+        ensemble_at: size at which members become one map: the processing size, or the image's (Marigold-DC).
         crisp: the result is finished at full resolution
             ([dataflow](../explanation/dataflow.md#how-edges-become-crisp)).
         smoothness: weight of the correction's slope against a match of full confidence, on a grid 512 pixels
@@ -206,12 +207,13 @@ class GuidanceConfig:
     planes: int = _number(160, 24, 4096, int, paper="-")
     search: str = _choice("volume", "one-number", "points-range")
     positive: str = _choice("softplus", "square")
-    g_s_range: tuple[float, float] = _pair((1.0, 80.0))
+    g_s_range: tuple[float, float] = _pair((1.0, 80.0), paper="{}, not given")
     g_s_candidates: int = _number(80, 2, 100_000, int, paper="{}, not given")
     reject_reflections: bool = _flag(True)
     correct: bool = _flag(True)
     corrections: int = _number(2, 1, 10_000, int, paper="-")
     even_ensemble: str = _choice("mean", "lower", paper="-")
+    ensemble_at: str = _choice("processing", "image", paper="-")
     crisp: bool = _flag(True)
     smoothness: float = _number(40.0, TINY, 1e6, paper="-")
     match_noise: float = _number(0.02, TINY, 1e3, paper="-")
@@ -340,6 +342,7 @@ MARIGOLD_DC = DEFAULT.changed(
     search="points-range",
     step_from="updated",
     even_ensemble="lower",
+    ensemble_at="image",
     sweep_pixels=1 << 32,
     correct=False,
     crisp=False,

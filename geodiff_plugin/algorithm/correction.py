@@ -252,11 +252,13 @@ def fit_depth(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Least-squares correction of log depth that follows matches and stops at edges.
 
-    With ``u`` the correction and ``r`` the residual of each match after earlier passes, a pass is the
-    minimiser of ``sum w (u - r)^2 + a sum g |grad u|^2 + b sum u^2``: ``w`` is the confidence over the
+    With ``u`` the correction and ``r`` the residual of each match after earlier passes, a pass goes towards
+    the minimiser of ``sum w (u - r)^2 + a sum g |grad u|^2 + b sum u^2``: ``w`` is the confidence over the
     match's relative variance, robustly reweighted, and ``g`` falls at edges of the image and of the given
     depth. Passes go from a broad ``a`` to that of the prior's error: a pixel far from matches keeps the
-    correction that the broad passes gave its region. The number of solves is fixed, so no GPU is waited for.
+    correction that the broad passes gave its region. Every solve is truncated after ``SOLVER_STEPS``
+    conjugate-gradient steps on each grid of a pyramid, a fixed number, so that no GPU is waited for.
+    ``tests/unit/test_solver.py`` bounds how far that leaves the depth from the exact minimisers.
 
     Args:
         depth_m: ``(B, 1, H, W)`` metres, at any resolution.

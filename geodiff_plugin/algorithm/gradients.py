@@ -14,6 +14,18 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 
+#: The bits of a float32 that hold its exponent; alone they are the power of two at or below the number.
+EXPONENT_BITS = 0x7F800000
+
+
+def power_above(largest: Tensor) -> Tensor:
+    """The least power of two above each number of ``(B,)``, which is not negative; float32.
+
+    Below the least normal number it is twice that. Read from the bits, as Apple's GPUs lack ``torch.frexp``.
+    """
+    below = (largest.float().view(torch.int32) & EXPONENT_BITS).view(torch.float32)
+    return 2.0 * below.clamp_min(torch.finfo(torch.float32).tiny)
+
 
 def pull_back(output: Tensor, source: Tensor, gradient: Tensor) -> Tensor:
     """The gradient in ``source`` of a loss whose gradient in ``output`` is given; frees the graph between.
@@ -21,8 +33,7 @@ def pull_back(output: Tensor, source: Tensor, gradient: Tensor) -> Tensor:
     Each sample's gradient is first scaled so that its largest entry is between 1/2 and 1: otherwise it could
     under- or overflow in float16. The factor is a power of two, so in float32 it changes nothing.
     """
-    largest = gradient.detach().abs().flatten(1).amax(1)
-    unit = torch.ldexp(torch.ones_like(largest), torch.frexp(largest).exponent)
+    unit = power_above(gradient.detach().abs().flatten(1).amax(1))
     scaled = gradient / unit.view(-1, *([1] * (gradient.ndim - 1)))
     (pulled,) = torch.autograd.grad(output, source, scaled.to(output.dtype))
     return pulled * unit.view(-1, *([1] * (pulled.ndim - 1))).to(pulled.dtype)

@@ -125,7 +125,8 @@ def _as_list(given: Any) -> list[Tensor]:
         values = torch.as_tensor(np.ascontiguousarray(each) if isinstance(each, np.ndarray) else each)
         if values.ndim != 2 or min(values.shape) < 2 or values.is_complex():
             bad_value("depth_map", "a map (h, w) of 2 x 2 pixels or more", f"shape {tuple(values.shape)}")
-        values = values.double()
+        # Not float64 for all: Apple's GPUs lack it, and of two float32 the difference is as exact in float32.
+        values = values if values.dtype in (torch.float32, torch.float64) else values.float()
         inside = values.isfinite()
         if not inside.any() or values[inside].min() == values[inside].max():
             cure = "Not finite means unknown; a map must tell near from far somewhere."

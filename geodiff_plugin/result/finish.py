@@ -22,7 +22,7 @@ from geodiff_plugin.geometry import image_size, resize_intrinsics
 from geodiff_plugin.matching import Matches, build_cost_volume, match_volume
 from geodiff_plugin.messages import Message
 from geodiff_plugin.result.confidence import depth_confidence, reprojection
-from geodiff_plugin.result.ensemble import median, spread_around
+from geodiff_plugin.result.ensemble import ensemble_metric, median, spread_around
 from geodiff_plugin.result.indicators import indicators_of, measure_indicators, read_numbers
 from geodiff_plugin.result.verdict import judge, points_agreement
 from geodiff_plugin.result.voting import vote_depth
@@ -94,7 +94,7 @@ def finish(
         options: what the call asks for.
     """
     native = evidence.native
-    depth_m = _within_range(depth_m.float().to(native.left_01.device), members)
+    depth_m, uncertainty = _one_map(members, depth_m.float().to(native.left_01.device), uncertainty, options)
     left_01 = _resized(native.left_01[None], image_size(depth_m))
     K = resize_intrinsics(native.K_left[None], native.size, image_size(depth_m))
     refined = refine(evidence, members, depth_m, left_01, options.config) if options.config.crisp else None
@@ -190,16 +190,34 @@ def refine(
     return Refined(fitted_m, support)
 
 
+def _member_at(size: tuple[int, int], member: Member, like: Tensor, options: ResultOptions) -> Tensor:
+    """A member's map ``(1, 1, H, W)`` metres at a size, resized as the stock call resizes the ensemble's."""
+    depth_m = member.depth_m.to(like)
+    if image_size(depth_m) == size:
+        return depth_m
+    resized = MarigoldImageProcessor.resize_antialias(depth_m, size, options.resampling, is_aa=False)
+    return _within_range(resized, [member])
+
+
+def _one_map(
+    members: Sequence[Member], depth_m: Tensor, uncertainty: Tensor | None, options: ResultOptions
+) -> tuple[Tensor, Tensor | None]:
+    """The map and the spread of an ensemble: as the stock call reduced it, or reduced at the map's size."""
+    if options.config.ensemble_at == "processing" or len(members) == 1:
+        return _within_range(depth_m, members), uncertainty
+    maps = torch.cat([_member_at(image_size(depth_m), member, depth_m, options) for member in members])
+    lower = options.config.even_ensemble == "lower"
+    reduced_m, spread_m = ensemble_metric(maps, options.reduction, lower)
+    return reduced_m, None if uncertainty is None else spread_m
+
+
 def _spread_of_members(
     evidence: Evidence, members: Sequence[Member], depth_m: Tensor, left_01: Tensor, options: ResultOptions
 ) -> Tensor:
     """Spread of the members, each refined like ``depth_m``, around it, ``(1, 1, H, W)`` metres."""
     size, refined_m = image_size(depth_m), []
     for member in members:
-        member_m = member.depth_m.to(depth_m)
-        if image_size(member_m) != size:  # resized as the stock call resizes the ensemble
-            resize = MarigoldImageProcessor.resize_antialias
-            member_m = _within_range(resize(member_m, size, options.resampling, is_aa=False), [member])
+        member_m = _member_at(size, member, depth_m, options)
         refined = refine(evidence, [member], member_m, left_01, options.config)
         assert refined is not None  # as the map of all members
         refined_m.append(refined.depth_m)

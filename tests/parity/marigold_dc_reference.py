@@ -26,6 +26,8 @@ CASES = {
     "four": ((48, 64), 0, 4, 1),
     "resized": ((61, 91), 64, 3, 1),  # padded and resized on the way in, cropped and resized on the way out
     "ensemble": ((48, 64), 0, 2, 3),
+    "two resized": ((61, 91), 64, 2, 2),  # the median is taken at the image's size, of two the lower
+    "three resized": ((61, 91), 64, 2, 3),
 }
 SEED = 2024
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from geodiff_plugin.algorithm import edges
 from geodiff_plugin.algorithm.correction import correction_target, fit_depth, off_edges
 from geodiff_plugin.algorithm.edges import sharpen_edges
-from geodiff_plugin.algorithm.gradients import RULES, Adam, FiniteWatch, pull_back
+from geodiff_plugin.algorithm.gradients import RULES, Adam, FiniteWatch, power_above, pull_back
 from geodiff_plugin.algorithm.schedule import count_steps, make_schedule
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
 from geodiff_plugin.config import DEFAULT
@@ -91,6 +91,20 @@ def test_the_first_that_is_not_finite_is_named_with_its_step_and_the_cure():
         watch.check(torch.float16)
     with pytest.raises(ValueError, match="weights"):
         watch.check(torch.float32)
+
+
+def test_a_power_of_two_above_is_the_one_of_the_exponent():
+    """Against numpy's frexp, at every exponent, and at powers of two and their neighbours."""
+    exact = np.exp2(np.arange(-126, 127, dtype=np.float64)).astype(np.float32)
+    some = exact * np.random.default_rng(0).uniform(1.0, 2.0, exact.shape).astype(np.float32)
+    below, above = np.nextafter(exact[1:], np.float32(0)), np.nextafter(exact, np.float32(np.inf))
+    values = np.concatenate([exact, below, above, some])
+    expected = np.ldexp(np.float32(1), np.frexp(values)[1])
+    np.testing.assert_array_equal(power_above(torch.from_numpy(values)).numpy(), expected)
+    subnormal = power_above(torch.tensor([0.0, 1e-42]))
+    assert (subnormal == 2.0 * torch.finfo(torch.float32).tiny).all()
+    for dtype in (torch.float16, torch.bfloat16, torch.float64):
+        assert power_above(torch.tensor([3.0], dtype=dtype)).item() == 4.0
 
 
 def _system(height: int, width: int, link: float, seed: int = 0) -> FieldSystem:

@@ -22,7 +22,7 @@ from geodiff_plugin.evaluation.baselines import (
 )
 from geodiff_plugin.evaluation.datasets import DATASETS, find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import changed_ref
-from geodiff_plugin.evaluation.options import PosesOptions
+from geodiff_plugin.evaluation.options import COMMANDS, PosesOptions
 from geodiff_plugin.evaluation.pairs import CHANGES, FLATNESS, changes_table
 from geodiff_plugin.evaluation.paper import LAYOUTS, layout_table
 from geodiff_plugin.evaluation.poses import run_poses
@@ -221,6 +221,17 @@ def free_methods(monkeypatch):
 @pytest.fixture
 def scene(data):
     return data / "one"
+
+
+def test_the_papers_tables_run_its_ensemble_and_others_one_member():
+    of_paper = {name for name, command in COMMANDS.items() if _ensemble_of(command) == 10}
+    assert of_paper == set(LAYOUTS)
+    assert {_ensemble_of(COMMANDS[name]) for name in ("pairs", "parts", "flatness", "cost")} == {1}
+
+
+def _ensemble_of(command):
+    described = command.options.__dataclass_fields__.get("ensemble")
+    return None if described is None else described.default
 
 
 def test_table1_runs_what_is_there_and_tells_how_to_obtain_the_rest(
