@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin.geometry import to_device_of
 from geodiff_plugin.matching.census import grey
 
 _BLOCK = 8
@@ -81,28 +82,29 @@ def _transformed(blocks: Tensor, basis: Tensor) -> Tensor:
 
 
 def _table(like: Tensor) -> Tensor:
-    return like.new_tensor(_LUMA_STEPS).view(_BLOCK, _BLOCK)
+    return to_device_of(like, torch.tensor(_LUMA_STEPS, dtype=like.dtype, device="cpu")).view(_BLOCK, _BLOCK)
 
 
-def _first_edge(levels: Tensor, axis: int) -> int:
-    """Where the blocks begin, 0 to 7: a crop begins within one."""
+def _first_edge(levels: Tensor, axis: int) -> Tensor:
+    """Where the blocks begin, ``()`` 0 to 7: a crop begins within one."""
     steps = levels.diff(dim=axis).abs().clamp_max(_MOST_BLOCK_EDGE).mean(1 - axis)
     whole = steps[: steps.shape[0] // _BLOCK * _BLOCK].view(-1, _BLOCK).mean(0)
-    return (int(whole.argmax()) + 1) % _BLOCK
+    return (whole.argmax() + 1) % _BLOCK
 
 
 def _jpeg_scale(levels: Tensor, basis: Tensor) -> float:
-    """The largest steps that the coefficients of a picture are whole multiples of."""
-    rows, columns = zip(*_KEPT, strict=True)
-    top, left = _first_edge(levels, 0), _first_edge(levels, 1)
-    blocks = _to_blocks(levels[top:, left:], basis).reshape(-1, _BLOCK, _BLOCK)
-    value = blocks[:: math.ceil(len(blocks) / _MOST_BLOCKS), rows, columns].abs()[..., None]
+    """The largest steps of which the coefficients of a picture are multiples; its blocks begin at (0, 0)."""
+    blocks = _to_blocks(levels, basis).reshape(-1, _BLOCK, _BLOCK)
+    blocks = blocks[:: math.ceil(len(blocks) / _MOST_BLOCKS)]
+    value = torch.stack([blocks[:, row, column] for row, column in _KEPT], 1).abs()[..., None]
     step = torch.arange(2, _MOST_STEP, device=levels.device, dtype=levels.dtype)
     counts = value > 0.6 * step  # 0 is a multiple of everything
     number = counts.sum(0)
     fit = (torch.cos(2 * math.pi * value / step) * counts).sum(0) / number.clamp_min(1)
-    largest = (step * ((fit > _LEAST_FIT) & (number >= _LEAST_VALUES))).amax(-1)
-    scales = [scale for scale in (largest / _table(levels)[rows, columns]).tolist() if scale > 0]
+    largest = (step * ((fit > _LEAST_FIT) & (number >= _LEAST_VALUES))).amax(-1).cpu()
+    table = _table(largest)
+    of_table = torch.stack([table[row, column] for row, column in _KEPT])
+    scales = [scale for scale in (largest / of_table).tolist() if scale > 0]
     if len(scales) < _LEAST_VOTES:
         return 0.0
     middle = sorted(scales)[(len(scales) - 1) // 2]
@@ -110,21 +112,24 @@ def _jpeg_scale(levels: Tensor, basis: Tensor) -> float:
     return middle if agree >= _LEAST_VOTES else 0.0
 
 
-def _noise(levels: Tensor, basis: Tensor) -> float:
+def _noise_energy(levels: Tensor, basis: Tensor) -> Tensor:
+    """``()`` energy of the finest coefficients of the flattest blocks."""
     fine = _to_blocks(levels, basis)[..., _BLOCK // 2 :, _BLOCK // 2 :]
-    energy = fine.square().mean((-1, -2)).flatten()
-    return math.sqrt(float(torch.quantile(energy, _FLATTEST))) * _NOISE_OF_FLATTEST
+    return torch.quantile(fine.square().mean((-1, -2)).flatten(), _FLATTEST)
 
 
 def find_flaws(image_01: Tensor) -> tuple[float, float]:
     """How coarsely a photograph was compressed, and how noisy it is (standard deviation, levels of 255).
 
     The former is the steps of the JPEG quantisation as a multiple of table K.1: 1 at a quality of 50, .4 at
-    80; 0 where no trace of compression remains, as after resampling.
+    80; 0 where no trace of compression remains, as after resampling. A device is waited for twice.
     """
     levels = grey(image_01)[0] * 255.0
     basis = _basis(levels)
-    return _jpeg_scale(levels, basis), _noise(levels, basis)
+    edges = [_first_edge(levels, axis).to(levels) for axis in (0, 1)]
+    top, left, energy = torch.stack([*edges, _noise_energy(levels, basis)]).tolist()
+    scale = _jpeg_scale(levels[int(top) :, int(left) :], basis)
+    return scale, math.sqrt(energy) * _NOISE_OF_FLATTEST
 
 
 def _threshold(jpeg_scale: float, noise: float, like: Tensor) -> Tensor | None:
@@ -133,7 +138,7 @@ def _threshold(jpeg_scale: float, noise: float, like: Tensor) -> Tensor | None:
     noise *= min(max((noise - low) / (high - low), 0.0), 1.0)
     if not jpeg_scale and not noise:
         return None
-    threshold = torch.hypot(_STEPS * jpeg_scale * _table(like), like.new_tensor(_DEVIATIONS * noise))
+    threshold = torch.hypot(_STEPS * jpeg_scale * _table(like), like.new_full((), _DEVIATIONS * noise))
     threshold[0, 0] = 0.0  # the mean of a block is always kept
     return threshold
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.capture.capture import Capture
+from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.formats.captures import LAYOUTS, read_capture
 from geodiff_plugin.formats.lenses import undistorted_pixels
 from geodiff_plugin.formats.unknown import FOREIGN
