@@ -37,6 +37,17 @@ def use_kernel(tensor: torch.Tensor) -> bool:
     return _switched_on.get() and has_triton() and (on_device or interpreting())
 
 
+def kernels_in_use() -> str:
+    """Whether stages run by kernels on this machine, and if not, why; for ``geodiff info``."""
+    if not has_triton():
+        return "plain torch: Triton is not installed"
+    if interpreting():
+        return "Triton's interpreter, on the CPU"
+    if not torch.cuda.is_available() or torch.version.hip is not None:
+        return "plain torch: kernels need CUDA"
+    return "Triton on CUDA, compiled at the first call on a machine"
+
+
 @contextmanager
 def without_kernels(off: bool = True) -> Iterator[None]:
     """Run the reference of every stage within the block, in this thread, if ``off``."""

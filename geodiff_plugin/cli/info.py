@@ -9,6 +9,7 @@ import torch
 from huggingface_hub import CacheNotFound, scan_cache_dir
 
 from geodiff_plugin._checks import refuse
+from geodiff_plugin._kernels import kernels_in_use
 from geodiff_plugin.cli.terminal import print_lines
 from geodiff_plugin.config import knob_lines
 from geodiff_plugin.priors import PRIORS, PriorSource, find_prior, prior_of
@@ -62,6 +63,7 @@ def run_info(prior: str | None, space: str | None, knobs: bool) -> None:
         device = torch.cuda.get_device_properties(index)
         rows.append(("device", f"cuda:{index} ({device.name}, {device.total_memory / 2**30:.0f} GiB)"))
     rows += [("device", "mps")] if torch.backends.mps.is_available() else []
+    rows.append(("kernels", kernels_in_use()))
     try:
         models = [repo for repo in scan_cache_dir().repos if repo.repo_type == "model"]
     except CacheNotFound:

@@ -6,7 +6,7 @@ import csv
 import errno
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from geodiff_plugin._checks import InputError, bad_value, refuse
+from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.evidence.store import EvidenceStore
@@ -37,7 +38,10 @@ from geodiff_plugin.runtime.machine import pick_device
 #: What became of every pair, as it is known to all processes of a run.
 JOURNAL = ".pairs.jsonl"
 #: Options that a result does not depend on.
-NOT_OF_THE_RESULT = {"out", "overwrite", "quiet", "json", "strict", "steady", "device", "encoding"}
+NOT_OF_THE_RESULT = {
+    *("out", "overwrite", "quiet", "json", "strict", "steady"),
+    *("device", "graphs", "no_kernels", "encoding"),
+}
 #: With one of these causes the next pair cannot be written either.
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 Row = dict[str, Any]
@@ -145,12 +149,14 @@ class Stages:
         if self._pipe is None:
             try:
                 tell = None if self._tell is silent else self._tell
-                self._pipe = prior_of_options(self._options, self._device, tell)
+                # Pictures of a folder mostly have one size, for which recording pays.
+                graphs = self._options.graphs or self._device.type == "cuda"
+                self._pipe = prior_of_options(replace(self._options, graphs=graphs), self._device, tell)
             except Exception as error:
                 raise _EndsRun from error
         device, guidance = self._pipe._execution_device, pair.inputs.guidance
-        plain = torch.autocast(device.type, enabled=False)
-        with pair.log.stage("evidence"), WithinCores(self._among), torch.no_grad(), plain:
+        plain, kernels = torch.autocast(device.type, enabled=False), without_kernels(self._options.no_kernels)
+        with pair.log.stage("evidence"), WithinCores(self._among), torch.no_grad(), plain, kernels:
             guidance.evidence_store = EvidenceStore(1, copies=False)
             guidance.prepare(left_images(pair.inputs.left).to(device))
         return pair

@@ -153,6 +153,10 @@ class DepthOptions(RunOptions):
         choices=("glb", "mesh", "colmap"),
     )
     quiet: bool = _output(False, "Show no progress bar and no summary.", "--quiet", "-q")
+    graphs: bool = declare(
+        False, "Networks as CUDA graphs, and a faster group norm in half precision (on for many pairs)."
+    )
+    no_kernels: bool = declare(False, "No Triton kernels: every stage in plain torch.")
     json: bool = _output(False, "Print the report as JSON instead of the summary.")
 
     def __post_init__(self) -> None:

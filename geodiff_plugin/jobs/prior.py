@@ -57,4 +57,5 @@ def load_guided_prior(
 
 def prior_of_options(options: DepthOptions, device: torch.device, tell: Tell | None = None) -> Any:
     """``load_guided_prior`` as the options say."""
-    return load_guided_prior(options.prior, device, options.space, options.dtype, options.option, tell)
+    pipe = load_guided_prior(options.prior, device, options.space, options.dtype, options.option, tell)
+    return enable_geometry_guidance(pipe, graphs=options.graphs, kernels=not options.no_kernels)

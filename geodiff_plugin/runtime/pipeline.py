@@ -14,6 +14,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, noted, refuse, warn
+from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin.algorithm.prompt import depth_prompt
 from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.evidence.evidence import Evidence
@@ -26,6 +27,7 @@ from geodiff_plugin.result.ensemble import ensemble_metric
 from geodiff_plugin.result.output import image_labels
 from geodiff_plugin.runtime.beside import Beside
 from geodiff_plugin.runtime.estimate import ProcessingGrid, tiny_autoencoder
+from geodiff_plugin.runtime.graphs import FasterNetworks
 from geodiff_plugin.runtime.hooks import Exclusive, networks_of
 from geodiff_plugin.runtime.noise_levels import check_scheduler
 from geodiff_plugin.runtime.run import GuidedRun, RunInputs, StepCallback
@@ -46,6 +48,8 @@ class GuidedCall(_Stock):
     """Mixin for a stock pipeline: ``__call__`` takes ``guidance``, and a guided ensemble is in metres."""
 
     _guided_run: GuidedRun | None = None
+    _faster: FasterNetworks | None = None  # networks of guided calls, of ``graphs=True``
+    _uses_kernels: bool = True
 
     @torch.no_grad()
     def __call__(
@@ -91,7 +95,8 @@ class GuidedCall(_Stock):
             if guidance is None:
                 return super().__call__(image, *args, **kwargs)
             _check_guided_call(guidance, callback_on_step_end)
-            with torch.inference_mode(False), torch.no_grad(), noted() as warned:
+            plain_torch = without_kernels(not self._uses_kernels)
+            with torch.inference_mode(False), torch.no_grad(), plain_torch, noted() as warned:
                 call = _bind(super().__call__, image, *args, **kwargs)
                 run, stock = self._call_guided(call, guidance, callback_on_step_end, held)
                 with torch.autocast(self._execution_device.type, enabled=False):
@@ -317,16 +322,34 @@ def _guided_class(stock: type) -> type:
     return type(f"Guided{stock.__name__}", (GuidedCall, stock), {"__doc__": GuidedCall.__doc__})
 
 
-def enable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
+def enable_geometry_guidance(
+    pipe: DiffusionPipeline, *, graphs: bool | None = None, kernels: bool | None = None
+) -> DiffusionPipeline:
     """Let a live pipeline take ``guidance=``; nothing else about it changes. Returns the same object.
 
+    An option that is left out stays as it is, at first ``graphs=False`` and ``kernels=True``; calls without
+    ``guidance`` heed neither.
+
+    Args:
+        pipe: a pipeline of a prior in ``PRIORS``.
+        graphs: guided calls on CUDA run U-Net and VAE as CUDA graphs, recorded at the second call of a size,
+            and the group norms of a VAE in half precision by a kernel, equal within rounding. Each graph
+            holds memory of its own. Where gradients go through a network it runs as always.
+        kernels: stages run by Triton kernels where there are some; ``False``: by their references.
+
     Raises:
-        InputError: no adapter in ``PRIORS`` understands it, or its call hides the stock arguments.
+        InputError: no adapter in ``PRIORS`` understands it, or its call hides the stock arguments; ``graphs``
+            with offloading.
     """
     prior_of(pipe)
+    faster = FasterNetworks(pipe) if graphs else None
     if not isinstance(pipe, GuidedCall):
         _check_named_arguments(type(pipe))
         pipe.__class__ = _guided_class(pipe.__class__)
+    if graphs is not None:
+        pipe._faster = faster
+    if kernels is not None:
+        pipe._uses_kernels = kernels
     return pipe
 
 
@@ -334,4 +357,6 @@ def disable_geometry_guidance(pipe: DiffusionPipeline) -> DiffusionPipeline:
     """Undo ``enable_geometry_guidance``; on a pipeline that is not enabled it does nothing."""
     if isinstance(pipe, GuidedCall):
         pipe.__class__ = _stock_class(type(pipe))
+        for name in {"_faster", "_uses_kernels"} & set(vars(pipe)):
+            delattr(pipe, name)
     return pipe

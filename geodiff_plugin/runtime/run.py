@@ -85,6 +85,8 @@ class GuidedRun:
         with ExitStack() as stack:
             stack.enter_context(hooks.frozen_weights(self.pipe))
             stack.enter_context(hooks.images_in_float32(self.pipe.image_processor))
+            if self.pipe._faster is not None:
+                stack.enter_context(self.pipe._faster.attached(self.pipe))
             if self._tap is not None:
                 stack.enter_context(self._tap.attached())
             stack.enter_context(self._scheduler.attached())

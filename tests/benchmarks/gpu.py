@@ -36,6 +36,7 @@ from geodiff_plugin._kernels import has_triton, without_kernels
 from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, DemoPair, read_demo_pair
 from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.runtime.graphs import FasterNetworks
 from geodiff_plugin.runtime.machine import timed
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from tests.benchmarks import full_sizes
@@ -124,6 +125,20 @@ def _referred(call: Callable[[], Any]) -> Callable[[], Any]:
     return referred
 
 
+def _graphed(pipe: Any, call: Callable[[], Any], is_plain: bool) -> Callable[[], Any]:
+    """The call with graphs and faster norms, which a plain call has only here, to be compared with."""
+    faster = FasterNetworks(pipe)
+
+    def graphed() -> Any:
+        if is_plain:
+            with torch.no_grad(), faster.attached(pipe):
+                return call()
+        with patch.object(pipe, "_faster", faster):
+            return call()
+
+    return graphed
+
+
 def _difference(result: Any, reference: Any) -> tuple[float, float]:
     """Mean and largest relative difference of two depth maps."""
     relative = np.abs(result.prediction / reference.prediction - 1.0)
@@ -210,12 +225,16 @@ def full_size(bench: Bench) -> Iterator[Row]:
     calls = {way: call_of(way, pipe, size, bench.tiny) for way in WAYS}
     calls[f"{MARIGOLD_DC}, {size.dc_steps} steps"] = calls.pop(MARIGOLD_DC)
     calls["guided, without kernels"] = _referred(calls["guided"])
+    for way in ("plain", "guided", "guided, tiny decoder"):
+        calls[f"{way}, graphs"] = _graphed(pipe, calls[way], way == "plain")
     yield from bench.rows(calls)
     published = call_of(MARIGOLD_DC, pipe, replace(size, dc_steps=bench.scope.published_steps), bench.tiny)
     seconds = timed(published, bench.device)
     yield {"once": f"{MARIGOLD_DC}, {bench.scope.published_steps} steps", "ms": round(1e3 * seconds, 1)}
-    mean, most = _difference(calls["guided"](), calls["guided, without kernels"]())
-    yield {"differences": "guided from guided without kernels", "mean": mean, "largest": most}
+    guided = calls["guided"]()
+    for other in ("guided, without kernels", "guided, graphs"):
+        mean, most = _difference(calls[other](), guided)
+        yield {"differences": f"{other} from guided", "mean": mean, "largest": most}
 
 
 def stages(bench: Bench) -> Iterator[Row]:

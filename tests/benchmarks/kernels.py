@@ -25,6 +25,7 @@ from geodiff_plugin.algorithm import kernels as algorithm
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.matching import kernels as matching
 from geodiff_plugin.matching.census import MARGIN_PX, SIDE, VOTE_LEVELS
+from geodiff_plugin.runtime import kernels as runtime
 from geodiff_plugin.scale import kernels as scale
 
 #: Compute capabilities of an A100 and of an H100.
@@ -51,6 +52,7 @@ def launches() -> Iterator[Compiled]:
     """Every kernel, at the largest sizes that are usual."""
     yield from _of_the_matching()
     yield from _of_the_solver()
+    yield from _of_the_networks()
     yield from _of_the_scale()
 
 
@@ -70,6 +72,14 @@ def _of_the_matching() -> Iterator[Compiled]:
     yield Compiled("sweep", matching.census_cost_kernel, sweep, census | block, 4)
     look_up = "*u8 *i32 *i32 *u8" + 8 * " i32"
     yield Compiled("costs of a right view", matching.look_up_kernel, look_up, block, 4)
+
+
+def _of_the_networks() -> Iterator[Compiled]:
+    sizes = {"BLOCK": runtime.BLOCK}
+    yield Compiled("group norm, moments", runtime.moments_kernel, "*bf16 *fp32 i32 i32 i32", sizes, 4)
+    norm = "*bf16 *bf16 *fp32 *bf16 *bf16" + 6 * " i32" + " fp32"
+    sizes = sizes | {"PARTS": runtime.MOST_PARTS}
+    yield Compiled("group norm", runtime.normalise_kernel, norm, sizes, 4)
 
 
 def _of_the_scale() -> Iterator[Compiled]:

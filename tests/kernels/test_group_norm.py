@@ -1,0 +1,36 @@
+"""The kernel of the group norm against ``torch.nn.functional.group_norm``."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+#: Largest difference by number format: rounding of the result, or of sums in another order.
+TOLERANCES = {torch.float32: 2e-5, torch.float16: 4e-3, torch.bfloat16: 4e-2}
+
+
+@settings(max_examples=5, deadline=None)
+@given(
+    seed=st.integers(0, 999),
+    batch=st.integers(1, 2),
+    groups=st.sampled_from([1, 3]),
+    channels=st.integers(1, 3),
+    size=st.tuples(st.integers(1, 24), st.integers(1, 24)),
+    dtype=st.sampled_from(sorted(TOLERANCES, key=str)),
+)
+def test_any_size_and_number_format(device, seed, batch, groups, channels, size, dtype):
+    kernels = pytest.importorskip("geodiff_plugin.runtime.kernels")
+    generator = torch.Generator().manual_seed(seed)
+    x = 3 * torch.randn(batch, groups * channels, *size, generator=generator) + 1
+    weight, bias = (torch.randn(groups * channels, generator=generator) for _ in range(2))
+    x, weight, bias = (value.to(device, dtype) for value in (x, weight, bias))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernels, "BLOCK", 128)  # so that a small group has several parts
+        found = kernels.group_norm(x, groups, weight, bias, 1e-6)
+    expected = F.group_norm(x.float(), groups, weight.float(), bias.float(), 1e-6)
+    assert found.dtype == dtype
+    # A group of one value has no variance: what is left of it is rounding.
+    if channels * size[0] * size[1] > 1:
+        scale = expected.abs().amax().clamp_min(1.0)
+        assert (found.float() - expected).abs().max() <= TOLERANCES[dtype] * scale
