@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class _ListOptions:
-    data: Path | None = declare(None, "Folder to look into.")
+    data: Path | None = declare(None, "Folder to look for data sets in.")
 
 
 def run_and_show(measure: Callable[[Any], Any], options: Any) -> None:
@@ -70,6 +70,6 @@ def _list(options: _ListOptions) -> None:
     print_lines(rows)
 
 
-LIST = Command(_ListOptions, _list, "Say which data sets are there; list the methods.")
+LIST = Command(_ListOptions, _list, "List the data sets and the methods.")
 _COMMANDS = {name: each._replace(run=partial(run_and_show, each.run)) for name, each in COMMANDS.items()}
-eval_app = new_group("Measure this package on data sets, beside other methods.", _COMMANDS | {"list": LIST})
+eval_app = new_group("Evaluate this package and other methods on data sets.", _COMMANDS | {"list": LIST})

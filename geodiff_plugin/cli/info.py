@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from textwrap import wrap
+from textwrap import fill, wrap
 
 import torch
 from huggingface_hub import CacheNotFound, scan_cache_dir
@@ -17,8 +17,10 @@ from geodiff_plugin.priors.loading import no_bars
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
 from geodiff_plugin.runtime.machine import versions
 
-#: Characters of a value, so that a line with its name fits 80.
-LINE_WIDTH = 62
+#: Columns of a terminal as it opens.
+SCREEN_WIDTH = 80
+#: Those of a value, beside its name.
+LINE_WIDTH = SCREEN_WIDTH - 18
 
 
 def _describe(source: PriorSource, space: str | None) -> list[tuple[str, str]]:
@@ -50,7 +52,8 @@ def _describe(source: PriorSource, space: str | None) -> list[tuple[str, str]]:
 def run_info(prior: str | None, space: str | None, knobs: bool) -> None:
     """Print it, with what a prior is, or the knobs instead."""
     if knobs:
-        print("\n".join(knob_lines()))
+        for line in knob_lines():
+            print(fill(line, SCREEN_WIDTH, subsequent_indent=" " * 6))
         return
     if space is not None and prior is None:
         refuse("--space needs --prior: it describes that prior.")

@@ -46,7 +46,9 @@ CAPTURE_ROWS = {
 
 def out_folder(folder: str) -> Any:
     """The folder of a run, by default this one."""
-    return declare(Path(folder), "Records and results; resumed where it exists.", "--out", "-o", panel=OUTPUT)
+    return declare(
+        Path(folder), "Folder of records and results; a run in it is resumed.", "--out", "-o", panel=OUTPUT
+    )
 
 
 def listed(default: tuple[Any, ...], help_text: str, **rules: Any) -> Any:
@@ -56,7 +58,7 @@ def listed(default: tuple[Any, ...], help_text: str, **rules: Any) -> Any:
 
 def some_of(names: Collection[str]) -> Any:
     """Some of these names, by default all."""
-    return listed(tuple(names), f"Comma-separated: {', '.join(names)}.", choices=names)
+    return listed(tuple(names), f"Which of {', '.join(names)}, separated by commas.", choices=names)
 
 
 def count_of(default: int | None, help_text: str, low: int = 1, high: int = 10**9) -> Any:
@@ -74,10 +76,10 @@ class OutOptions:
     """What every command is told."""
 
     seed: int = declare(0, "Seed of the noise.")
-    steps: int | None = count_of(None, "Denoising steps; each method's own by default.", high=1000)
+    steps: int | None = count_of(None, "Denoising steps (default: each method's own).", high=1000)
     out: Path = out_folder("geodiff-eval")
-    results: Path | None = declare(None, "Write the Markdown page here as well.", panel=OUTPUT)
-    quiet: bool = declare(False, "No bar and nothing on the screen.", "--quiet", "-q", panel=OUTPUT)
+    results: Path | None = declare(None, "Also write the page as Markdown to this file.", panel=OUTPUT)
+    quiet: bool = declare(False, "Show no progress bar and no result.", "--quiet", "-q", panel=OUTPUT)
     program: str = field(default=PROGRAM)
 
     def __post_init__(self) -> None:
@@ -97,7 +99,7 @@ class OutOptions:
 class EvalOptions(OutOptions, PriorOptions):
     """What every command that runs a prior is told."""
 
-    dtype: str = declare("float32", f"{', '.join(DTYPES)}.", choices=DTYPES)
+    dtype: str = declare("float32", f"Number format of the prior: {', '.join(DTYPES)}.", choices=DTYPES)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,25 +107,39 @@ class SampleOptions(EvalOptions):
     """Which samples, of what data."""
 
     data: Path | None = folder_of("Folder with data sets, or the name of a registered set.")
-    methods: tuple[str, ...] = listed((), "Comma-separated, see geodiff eval list; beside the built-in rows.")
-    datasets: tuple[str, ...] = listed((), "Comma-separated; all that the folder has by default.")
-    scenes: tuple[str, ...] = listed((), "Comma-separated parts of sample names to keep.")
-    limit: int | None = count_of(None, "The first N samples alone; in a table of the paper, of each set.")
-    ensemble: int = count_of(1, "Ensemble members.", high=1000)
-    resolution: int | None = count_of(None, "Longer side for the prior, pixels.", 0, 8192)
-    views: int = count_of(2, "Views that methods take of a group that has more than two.", 2, 100)
-    perturb: str | None = declare(None, "Wrong poses: turn, shift / baseline.", metavar="DEGREES,SHARE")
+    methods: tuple[str, ...] = listed(
+        (), "Further methods, separated by commas; geodiff eval list names them."
+    )
+    datasets: tuple[str, ...] = listed((), "Data sets, separated by commas (default: all in the folder).")
+    scenes: tuple[str, ...] = listed(
+        (), "Keep samples whose names hold one of these words, separated by commas."
+    )
+    limit: int | None = count_of(
+        None, "Number of samples taken, from the first; in a table of the paper, of each data set."
+    )
+    ensemble: int = count_of(1, "Members of the ensemble.", high=1000)
+    resolution: int | None = count_of(None, "Longer side of the image for the prior, in pixels.", 0, 8192)
+    views: int = count_of(2, "Number of views taken of a scene that has more than two.", 2, 100)
+    perturb: str | None = declare(
+        None,
+        "Make the poses wrong, by a turn in degrees and a shift as a share of the baseline.",
+        metavar="DEGREES,SHARE",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairsOptions(SampleOptions):
     """What the tables over pairs are told: the paper's, of parts, of flatness, of cost."""
 
-    sample: int | None = count_of(None, "Draw this many samples at random, by --seed.")
-    pairs: str = declare("default", "Of posed views: default (two) or all.", choices=("default", "all"))
-    pixel_centre: float | None = declare(None, "First pixel's centre in posed cameras, 0.5 for COLMAP's.")
-    skip_broken: bool = declare(False, "Go on after a broken sample and count it.", panel=OUTPUT)
-    save_depth: bool = declare(False, "Write every depth map as .npy.", panel=OUTPUT)
+    sample: int | None = count_of(None, "Number of samples drawn at random, by --seed.")
+    pairs: str = declare(
+        "default", "Pairs of posed views: default (two a scene) or all.", choices=("default", "all")
+    )
+    pixel_centre: float | None = declare(
+        None, "Coordinate of the first pixel's centre in posed cameras: 0, or 0.5 as COLMAP has it."
+    )
+    skip_broken: bool = declare(False, "Go on after a broken sample, and count it.", panel=OUTPUT)
+    save_depth: bool = declare(False, "Also write every depth map as .npy.", panel=OUTPUT)
 
 
 #: Members of the ensemble whose numbers the paper prints (S5.1).
@@ -134,7 +150,9 @@ PAPER_ENSEMBLE = 10
 class PaperOptions(PairsOptions):
     """The tables of the paper, as the paper made them."""
 
-    ensemble: int = count_of(PAPER_ENSEMBLE, "Ensemble members; the paper's number by default.", high=1000)
+    ensemble: int = count_of(
+        PAPER_ENSEMBLE, "Members of the ensemble (default: the paper's number).", high=1000
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,32 +162,43 @@ class DirOptions(PairsOptions):
     data: Path | None = folder_of(
         "Folder of data sets, or the name of a registered set.", "", default=MISSING
     )
-    methods: tuple[str, ...] = listed(PEERS, "Comma-separated, see geodiff eval list.")
+    methods: tuple[str, ...] = listed(PEERS, "Methods, separated by commas; geodiff eval list names them.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class FigureOptions(SampleOptions):
     """``geodiff eval figure NAME``."""
 
-    name: str = declare(MISSING, f"{', '.join(FIGURES)}.", "", metavar="NAME")
-    max: float = declare(80.0, "gs-sweep: the last g_s, metres.", low=1.01, high=1e6)
+    name: str = declare(MISSING, f"Which figure: {', '.join(FIGURES)}.", "", metavar="NAME")
+    max: float = declare(80.0, "gs-sweep: the last g_s, in metres.", low=1.01, high=1e6)
     updates: tuple[int, ...] = listed(
-        (1, 2, 5, 10, 20, 40), "inner-steps: updates a step.", low=1, high=10**4
+        (1, 2, 5, 10, 20, 40),
+        "inner-steps: numbers of updates per step, separated by commas.",
+        low=1,
+        high=10**4,
     )
     results: Path | None = field(default=None)
-    clouds: bool = declare(False, "qualitative, ablation: point clouds from another view too.")
+    clouds: bool = declare(False, "qualitative, ablation: also draw point clouds from another view.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class PosesOptions(EvalOptions):
     """``geodiff eval poses``."""
 
-    data: Path | None = folder_of("Folder of pairs, or the name of a registered set; none by default.")
-    limit: int | None = count_of(None, "The first N pairs of --data alone.")
-    exact: Path | None = folder_of("The same for pairs whose poses are exact, to be perturbed.")
-    perturb: str = declare("1.5,0.1", "Of --exact: turn, shift / baseline.", metavar="DEGREES,SHARE")
-    drift: str = declare("0.3,1.5", "Rectified: turn and shift of the right image.", metavar="DEGREES,PIXELS")
-    resolution: int | None = count_of(None, "Longer side for the prior, pixels.", 0, 8192)
+    data: Path | None = folder_of("Folder of pairs, or the name of a registered set (default: none).")
+    limit: int | None = count_of(None, "Number of pairs of --data taken, from the first.")
+    exact: Path | None = folder_of("The same, of pairs whose poses are exact and are made wrong here.")
+    perturb: str = declare(
+        "1.5,0.1",
+        "How wrong, with --exact: a turn in degrees, a shift as a share of the baseline.",
+        metavar="DEGREES,SHARE",
+    )
+    drift: str = declare(
+        "0.3,1.5",
+        "How wrong, of rectified pairs: turn and shift of the right image.",
+        metavar="DEGREES,PIXELS",
+    )
+    resolution: int | None = count_of(None, "Longer side of the image for the prior, in pixels.", 0, 8192)
     out: Path = out_folder("geodiff-poses")
 
 
@@ -178,9 +207,13 @@ class CaptureEvalOptions(EvalOptions):
     """``geodiff eval capture DIR ...``."""
 
     data: tuple[Path, ...] = folder_of("Captures that name depth maps of their frames.", "", default=MISSING)
-    frames: str | None = declare(None, "NAME,NAME or FIRST:LAST:STEP; all by default.")
-    count: int | None = count_of(None, "So many frames of each, evenly spread, in place of --frames.", 2)
-    neighbours: tuple[int, ...] = listed((2, 3, 5), "Comma-separated numbers of right views.", low=1, high=32)
+    frames: str | None = declare(None, "Frames, NAME,NAME or FIRST:LAST:STEP (default: all).")
+    count: int | None = count_of(
+        None, "Number of frames of each capture, evenly spread, instead of --frames.", 2
+    )
+    neighbours: tuple[int, ...] = listed(
+        (2, 3, 5), "Numbers of right views, separated by commas.", low=1, high=32
+    )
     rows: tuple[str, ...] = some_of(CAPTURE_ROWS)
 
 
@@ -200,17 +233,19 @@ class _Entry(NamedTuple):
 _PAPER = "paper.run_paper_table"
 _CHANGES = "pairs.run_changes"
 _TABLE = {
-    "pairs": _Entry(DirOptions, "pairs.run_pairs", "Methods side by side on every metric pair below DIR."),
+    "pairs": _Entry(DirOptions, "pairs.run_pairs", "Compare methods on every metric pair below DIR."),
     "table1": _Entry(PaperOptions, _PAPER, "Table 1: KITTI, Booster and Middlebury, in metres and aligned."),
     "table2": _Entry(PaperOptions, _PAPER, "Table 2: Booster, beside stereo."),
     "table3": _Entry(PaperOptions, _PAPER, "Table 3: two posed views, Tanks and Temples."),
     "ablation": _Entry(PaperOptions, _PAPER, "Table 4, and one change at a time: gradients, rules, terms."),
-    "parts": _Entry(PairsOptions, _CHANGES, "The default with one of its parts left out at a time."),
-    "flatness": _Entry(PairsOptions, _CHANGES, "Every number of the default, at half and at twice."),
+    "parts": _Entry(PairsOptions, _CHANGES, "The default, with one part left out at a time."),
+    "flatness": _Entry(PairsOptions, _CHANGES, "The default, with one number halved or doubled at a time."),
     "cost": _Entry(PairsOptions, "pairs.run_cost", "Seconds and peak memory, plain against guided."),
-    "figure": _Entry(FigureOptions, "figures.run_figure", "Draw one figure as PNG, its numbers as JSON."),
-    "poses": _Entry(PosesOptions, "poses.run_poses", "Poses given, refined, estimated, perturbed."),
-    "capture": _Entry(CaptureEvalOptions, "captures.run_capture_eval", "Depth of a capture (extra capture)."),
+    "figure": _Entry(FigureOptions, "figures.run_figure", "Draw a figure as PNG, with its numbers as JSON."),
+    "poses": _Entry(PosesOptions, "poses.run_poses", "Compare given, refined, estimated and wrong poses."),
+    "capture": _Entry(
+        CaptureEvalOptions, "captures.run_capture_eval", "Evaluate captures (needs the extra 'capture')."
+    ),
 }
 #: Every command but ``list``, by name.
 COMMANDS = {
