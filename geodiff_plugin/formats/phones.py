@@ -1,7 +1,7 @@
 """What scanning apps of phones leave as raw data: Polycam, Record3D, Stray Scanner; all in metres, by ARKit.
 
 Source: ``process_data/polycam_utils.py`` and ``record3d_utils.py`` of nerfstudio-project/nerfstudio;
-``docs/format.md`` of strayrobots/scanner and ``stray_visualize.py`` of kekeblom/StrayVisualizer.
+the page on its format of strayrobots/scanner and ``stray_visualize.py`` of kekeblom/StrayVisualizer.
 """
 
 from __future__ import annotations

@@ -223,7 +223,7 @@ def _row(report: dict[str, Any]) -> Row:
         "median_m": depth["median_m"],
         "far_m": depth["max_m"],
         "verdict": verdict["status"],
-        "confidence": verdict["signs"]["confidence"] if verdict["status"] == "trusted" else None,
+        "confidence": verdict["indicators"]["confidence"] if verdict["status"] == "trusted" else None,
         "seconds": round(sum(report["seconds"].values()), 3),
         "message": " ".join(report["warnings"]) or None,
         "reasons": " ".join(verdict["reasons"]),

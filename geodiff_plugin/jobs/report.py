@@ -82,9 +82,10 @@ def _rescaled(E: np.ndarray, output: MetricDepthOutput) -> np.ndarray:
 
 
 def verdict_report(output: MetricDepthOutput) -> dict[str, Any]:
-    """The verdict as reports have it, with the indicators as ``signs``."""
+    """The verdict as reports have it; for one release its indicators also have their former names."""
     verdict: dict[str, Any] = plain(asdict(output.verdict))
-    return verdict | {"signs": verdict.pop("indicators")}
+    former = {"order" if name == "rank_correlation" else name: x for name, x in verdict["indicators"].items()}
+    return verdict | {"signs": former}
 
 
 def messages_of(output: MetricDepthOutput, *more: Iterable[Message]) -> list[dict[str, Any]]:
@@ -170,11 +171,15 @@ def summary_line(report: dict[str, Any], where: str) -> str:
     if verdict["status"] != "trusted":
         reason = verdict["reasons"][0] if verdict["reasons"] else f"{UNTESTED}."
         return f"{verdict['status'].upper()}: {reason} (Unconfirmed: {metres}; {end})"
-    signs, error, prior_scale = verdict["signs"], report.get("expected_error_median_m"), report["prior_scale"]
+    found, error, prior_scale = (
+        verdict["indicators"],
+        report.get("expected_error_median_m"),
+        report["prior_scale"],
+    )
     trusted = ["trusted if what is assumed holds" if report.get("assumed") else "trusted"]
-    trusted += [] if signs["confidence"] is None else [f"confidence {signs['confidence']:.2f}"]
+    trusted += [] if found["confidence"] is None else [f"confidence {found['confidence']:.2f}"]
     trusted += [] if error is None else [f"expected error {_length(error, report['unit'])}"]
-    trusted += [] if signs["matched"] is None else [f"{100 * signs['matched']:.0f} % matched"]
-    trusted += [f"{signs['points']} known depths"] if signs["points"] else []
+    trusted += [] if found["matched"] is None else [f"{100 * found['matched']:.0f} % matched"]
+    trusted += [f"{found['points']} known depths"] if found["points"] else []
     scale = [] if prior_scale is None else [f"prior's own metres x {prior_scale[0][0]:.2f}"]
     return "; ".join([metres, ", ".join(trusted), *scale, end])

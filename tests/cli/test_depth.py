@@ -32,7 +32,8 @@ def test_points_without_a_right_image_and_a_cloud_of_what_is_believed(geodiff, c
     assert answer.code == 0, answer.err
     report = json.loads(answer.out)
     assert names_in("geodiff-out") == FILES - {"visible.png", "photometric_error.npy"} | CONFIDENCE
-    assert report["verdict"]["signs"]["points"] == 192 and report["depth"]["visible_fraction"] == 0
+    assert report["verdict"]["indicators"]["points"] == report["verdict"]["signs"]["points"] == 192
+    assert report["depth"]["visible_fraction"] == 0
     doubtful, counts = np.load("geodiff-out/confidence.npy") < 0.6, report["files"]
     assert counts["doubtful_points"] == doubtful.sum()
     assert counts["cloud_points"] <= doubtful.size - doubtful.sum()

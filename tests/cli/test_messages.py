@@ -92,7 +92,10 @@ def test_the_summary_says_the_verdict_first():
     depth = np.array([[1.0, 2.0], [4.0, np.nan]], dtype=np.float32)
     summary, signs = depth_summary(depth, depth > 0), {"confidence": 0.876, "matched": 0.7, "points": 0}
     assert summary["invalid_pixels"] == 1 and summary["median_m"] == 2.0
-    verdict, metres = {"status": "trusted", "reasons": [], "signs": signs}, "1.00 m to 4.00 m, median 2.00 m"
+    verdict, metres = (
+        {"status": "trusted", "reasons": [], "indicators": signs},
+        "1.00 m to 4.00 m, median 2.00 m",
+    )
     report = {"depth": summary, "verdict": verdict, "seconds": {"load": 1}, "unit": "m", "prior_scale": None}
     assert summary_line(report, "out/") == f"{metres}; trusted, confidence 0.88, 70 % matched; 1.0 s -> out/"
     assert "in the calibration's lengths (no unit)" in summary_line(report | {"unit": None}, "out/")
