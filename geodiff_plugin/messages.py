@@ -105,6 +105,11 @@ MESSAGES: dict[str, MessageKind] = {
         cause="The camera has 10 or 12 bits, and its values were stored without scaling.",
         cure="Multiply the values by 64 (10 bits) or 16 (12 bits).",
     ),
+    "image.bits": MessageKind(
+        "16-bit images of a bag are taken to be of fewer bits",
+        cause="The camera has 10, 12 or 14 bits, and its driver stores the values as they come.",
+        cure="Nothing; of a camera of 16 bits the scene was dark.",
+    ),
     "image.alpha": MessageKind(
         "The alpha channel is dropped",
         cause="The image has four channels.",

@@ -17,22 +17,12 @@ import numpy as np
 import yaml
 
 from geodiff_plugin._checks import InputError, InputFileError, bad_value, refuse
+from geodiff_plugin.formats.bag_images import CODED, DECODE_CODED, both_as_01, decode_image
 from geodiff_plugin.formats.depth import depth_mm
 from geodiff_plugin.formats.files import check_file
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 BAG_SUFFIXES = (".mcap", ".bag")
-#: Encoding of a raw image -> type of its numbers, channels, and what makes RGB of it. OpenCV names Bayer
-#: patterns by the second row, ROS by the first.
-ENCODINGS: dict[str, tuple[str, int, int | None]] = {
-    **{"rgb8": ("u1", 3, None), "bgr8": ("u1", 3, cv2.COLOR_BGR2RGB)},
-    **{"rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB), "bgra8": ("u1", 4, cv2.COLOR_BGRA2RGB)},
-}
-for _bits in (8, 16):
-    for _name, _opencv in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB")):
-        ENCODINGS[f"bayer_{_name}{_bits}"] = (f"u{_bits // 8}", 1, getattr(cv2, f"COLOR_Bayer{_opencv}2RGB"))
-    for _name in (f"mono{_bits}", f"{_bits}UC1"):
-        ENCODINGS[_name] = (f"u{_bits // 8}", 1, cv2.COLOR_GRAY2RGB)
 
 
 def is_video(path: Path) -> bool:
@@ -126,6 +116,9 @@ def _open_bag(path: Path) -> Any:
 def _connections(reader: Any, path: Path, topic: str) -> list[Any]:
     images = [c for c in reader.connections if c.msgtype.endswith(("/Image", "/CompressedImage"))]
     topics = sorted({connection.topic for connection in images})
+    coded = {c.topic: c.msgtype for c in reader.connections if c.msgtype.endswith(CODED)}
+    if topic in coded:
+        bad_value(topic, "a topic of single images", f"coded video ({coded[topic]})", DECODE_CODED)
     if topic not in topics:
         got = f"{path}, whose images are {', '.join(topics) or 'none'}"
         bad_value(topic, "a topic of images in the bag", got)
@@ -152,6 +145,11 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
         raise
     except Exception as error:  # of any kind that a damaged bag leads to
         said = str(error).partition("\n")[0] or type(error).__name__
+        if "Profile is not ros2" in said:  # rosbags' words for messages of another kind, such as protobuf
+            cure = "Write both topics as folders of images, for example with mcap-protobuf-support, and give those."
+            bad_value(
+                "LEFT", "an MCAP file of ROS 2 messages", f"{path}, of other ones (protobuf, JSON)", cure
+            )
         bad_value("LEFT", "a whole bag that rosbags reads", f"{path} ({said})", "Is it cut off?")
     pairs, free = [], stamps[1]
     for left in stamps[0]:
@@ -184,33 +182,14 @@ class BagReader(AbstractContextManager["BagReader"]):
         if images[0].shape != images[1].shape:
             sizes = " and ".join("{1}x{0}".format(*image.shape) for image in images)
             raise InputFileError(f"pair {frame} of {self._path} must be of one size; got {sizes}.")
-        return np.hstack(images)
+        return np.hstack(both_as_01(images, self._path))
 
     def _image(self, connections: list[Any], stamp: Stamp) -> np.ndarray:
         at = stamp.recorded_ns
         for connection, _, raw in self._reader.messages(connections, at, at + 1):
             if _header_ns(raw, self._reader.is2) == stamp.header_ns:
-                return _decoded(self._reader.deserialize(raw, connection.msgtype), self._path)
+                return decode_image(self._reader.deserialize(raw, connection.msgtype), self._path)
         raise InputFileError(f"the image of {stamp.header_ns} ns in {self._path} does not read.")
-
-
-def _decoded(message: Any, path: Path) -> np.ndarray:
-    """``(H, W, 3)`` float32 in [0, 1] of an ``Image`` or a ``CompressedImage``."""
-    data = np.asarray(message.data, dtype=np.uint8)
-    if hasattr(message, "format"):
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-        if image is None:
-            raise InputFileError(f"an image of {path} ({message.format}) does not decode.")
-        image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    else:
-        if message.encoding not in ENCODINGS:
-            bad_value("the encoding", f"one of {', '.join(ENCODINGS)}", f"{message.encoding} in {path}")
-        kind, channels, code = ENCODINGS[message.encoding]
-        numbers = np.dtype((">" if message.is_bigendian else "<") + kind)
-        rows = data.reshape(message.height, message.step)[:, : message.width * channels * numbers.itemsize]
-        image = np.ascontiguousarray(rows).view(numbers).astype(kind).reshape(len(rows), -1, channels)
-        image = image if code is None else cv2.cvtColor(image, code)
-    return image.astype(np.float32) / np.iinfo(image.dtype).max
 
 
 def stereo_calibration(path: Path, topics: tuple[str, str]) -> tuple[list[str], str]:

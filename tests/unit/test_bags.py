@@ -90,6 +90,10 @@ def test_pairs_are_those_of_the_same_moments(tmp_path, suffix, topics) -> None:
 GREY = picture(0, 0)[..., 0]
 COLOUR, FLAT = np.dstack([GREY] * 3), np.full_like(GREY, 99)
 ALPHA = np.dstack([COLOUR, np.full_like(GREY, 9)])
+#: Grey by every encoding of luminance and colour differences: these are 128 then.
+LUMA = (16 + GREY.astype(float) * 219 / 255).round().astype(np.uint8)
+YUYV, UYVY = (np.dstack(pair) for pair in ((LUMA, np.full_like(LUMA, 128)), (np.full_like(LUMA, 128), LUMA)))
+NV12 = np.vstack([LUMA, np.full_like(LUMA[:24], 128)])
 MOSAIC = np.zeros(SIZE, np.uint8)
 MOSAIC[::2, ::2] = 200  # the red pixels of rggb
 
@@ -100,6 +104,19 @@ MOSAIC[::2, ::2] = 200  # the red pixels of rggb
         ("bgr8", COLOUR, GREY),
         ("bgra8", ALPHA, GREY),
         ("mono16", GREY.astype(np.uint16) * 257, GREY),
+        ("8UC3", COLOUR, GREY),
+        ("8UC4", ALPHA, GREY),
+        ("rgb16", COLOUR.astype(np.uint16) * 257, GREY),
+        ("16UC1", GREY.astype(np.uint16) * 257, GREY),
+        ("32FC1", (GREY / 255).astype(np.float32), GREY),
+        ("32FC1", GREY.astype(np.float32), GREY),
+        ("yuv422_yuy2", YUYV, GREY),
+        ("yuyv", YUYV, GREY),
+        ("uyvy", UYVY, GREY),
+        ("yuv422", UYVY, GREY),
+        ("nv12", NV12, GREY),
+        ("nv21", NV12, GREY),
+        ("BGR8", COLOUR, GREY),
         ("bayer_rggb8", FLAT, FLAT),
         ("bayer_grbg16", FLAT.astype(np.uint16) * 257, FLAT),
         ("bayer_rggb8", MOSAIC, None),
@@ -111,10 +128,54 @@ def test_encodings_of_raw_images(tmp_path, encoding, image, expected) -> None:
     with BagReader(path, TOPICS, 0.005) as reader:
         left = reader.read(0)[:, :64]
     if expected is not None:
-        np.testing.assert_allclose(left, np.dstack([expected] * 3) / 255, atol=1e-6)
+        off = 2 / 255 if encoding[:2] in ("yu", "uy", "nv") else 1e-6  # of 219 steps there
+        np.testing.assert_allclose(left, np.dstack([expected] * 3) / 255, atol=off)
     else:
         red, green, blue = left[10:-10, 10:54].mean((0, 1))
         assert red > 0.5 and green < 0.05 and blue < 0.05
+
+
+def test_colours_of_every_encoding_of_luminance(tmp_path) -> None:
+    """Pure red by BT.601: Y 81, U 90, V 240."""
+    y, u, v = (np.full((48, 64), value, np.uint8) for value in (81, 90, 240))
+    chroma = np.where(np.arange(64) % 2, v, u)
+    forms = {"yuyv": np.dstack([y, chroma]), "uyvy": np.dstack([chroma, y])}
+    forms |= {
+        "nv12": np.vstack([y, chroma[:24]]),
+        "nv21": np.vstack([y, np.where(np.arange(64) % 2, u, v)[:24]]),
+    }
+    for encoding, image in forms.items():
+        path = write_bag(tmp_path / f"{encoding}.mcap", encoding=encoding, images=(image, image))
+        with BagReader(path, TOPICS, 0.005) as reader:
+            np.testing.assert_allclose(reader.read(0)[5, 5], [1, 0, 0], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("bits", "encoding"), [(10, "mono16"), (12, "mono16"), (12, "mono12"), (10, "16UC1")]
+)
+def test_few_bits_in_sixteen_are_scaled_alike_for_both_views(tmp_path, bits, encoding) -> None:
+    full = GREY.astype(np.uint16) * (2**bits - 1) // 255
+    full[0, 0] = 2**bits - 1
+    path = write_bag(tmp_path / "a.mcap", encoding=encoding, images=(full, full // 8))
+    with BagReader(path, TOPICS, 0.005) as reader, pytest.warns(UserWarning, match=f"of {bits} bits"):
+        left, right = np.split(reader.read(0), 2, axis=1)
+    np.testing.assert_allclose(left[..., 0], full / (2**bits - 1), atol=1e-6)
+    np.testing.assert_allclose(right[..., 0], (full // 8) / (2**bits - 1), atol=1e-6)
+
+
+def test_what_no_reader_decodes_is_named_with_its_cure(tmp_path) -> None:
+    path = write_bag(tmp_path / "a.mcap", encoding="jpegxl", images=(GREY, GREY))
+    with BagReader(path, TOPICS, 0.005) as reader, pytest.raises(InputError, match="got jpegxl"):
+        reader.read(0)
+    mcap = pytest.importorskip("mcap.writer")
+    with open(tmp_path / "foxglove.mcap", "wb") as file:
+        writer = mcap.Writer(file)
+        writer.start()
+        schema = writer.register_schema("foxglove.CompressedImage", "protobuf", b"x")
+        writer.register_channel("/left", "protobuf", schema)
+        writer.finish()
+    with pytest.raises(InputError, match="MCAP file of ROS 2 messages.*protobuf.*mcap-protobuf-support"):
+        list_pairs(tmp_path / "foxglove.mcap", TOPICS, 0.005)
 
 
 def rig_of(path: Path, topics, folder: Path):
