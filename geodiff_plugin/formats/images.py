@@ -96,15 +96,16 @@ def _to_01(value: np.ndarray, name: str) -> tuple[np.ndarray, list[Message]]:
 
 
 def read_image(
-    path: PathLike, name: str = "left", *, as_stored: bool = False
+    path: PathLike, name: str = "left", *, as_stored: bool = False, page: int = 0
 ) -> tuple[np.ndarray, list[Message]]:
     """An image file, ``(H, W, 3)`` float32 in [0, 1], and sentences about what was done to it.
 
     It is turned upright by its EXIF orientation, unless its camera is one of the pixels ``as_stored``.
+    ``page`` is the number of a picture in a file of several.
     """
     with open_image(path, name) as image:
         notes = _file_notes(image, name)
-        image.seek(0)
+        image.seek(page)
         image.load()
         is_turned = image.getexif().get(ORIENTATION) in TURNS and not as_stored
         upright = ImageOps.exif_transpose(image) if is_turned else image
@@ -115,6 +116,12 @@ def read_image(
         said = f"{name} was turned or mirrored to {upright.width}x{upright.height}, as its EXIF says"
         notes.append(Message("image.turned", f"{said}; K must belong to the turned image."))
     return image_01, notes
+
+
+def picture_count(path: PathLike, name: str) -> int:
+    """How many pictures an image file holds."""
+    with open_image(path, name) as image:
+        return int(getattr(image, "n_frames", 1))
 
 
 def _hwc(value: Any, name: str) -> np.ndarray:

@@ -146,10 +146,9 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
     except Exception as error:  # of any kind that a damaged bag leads to
         said = str(error).partition("\n")[0] or type(error).__name__
         if "Profile is not ros2" in said:  # rosbags' words for messages of another kind, such as protobuf
-            cure = "Write both topics as folders of images, for example with mcap-protobuf-support, and give those."
-            bad_value(
-                "LEFT", "an MCAP file of ROS 2 messages", f"{path}, of other ones (protobuf, JSON)", cure
-            )
+            got = f"{path}, of other ones (protobuf, JSON)"
+            cure = "Write both topics as folders of images, as mcap-protobuf-support can, and give those."
+            bad_value("LEFT", "an MCAP file of ROS 2 messages", got, cure)
         bad_value("LEFT", "a whole bag that rosbags reads", f"{path} ({said})", "Is it cut off?")
     pairs, free = [], stamps[1]
     for left in stamps[0]:

@@ -29,6 +29,9 @@ WAYS = {
 }
 #: The ways to give the scale of a capture.
 OF_SCALE = ("metres_per_unit", "known_length", "distance")
+#: Files of stereo cameras that hold both pictures, by suffix.
+FILES_OF_BOTH = (".mpo",)
+SPATIAL = "Of a spatial photograph write both pictures first, for example by heif-dec of libheif."
 #: Fields that hold paths, but not of files that are read beside the photographs.
 PHOTOGRAPHS_AND_OUT = ("left", "right", "view", "out")
 
@@ -110,6 +113,7 @@ class DepthOptions(RunOptions):
     view_distortion: tuple[str, ...] = _camera(
         (), "Lens distortion of each --view; 0,0,0,0 for none (default: that of LEFT)."
     )
+    side_by_side: bool = declare(False, "LEFT is one picture with both views, the left one on the left.")
     cropped: bool = _camera(False, "Allow a principal point outside the image, as crops may have.")
     prior_map: Path | None = declare(
         None, "Take another model's depth map of LEFT, or a folder of maps, as the prior."
@@ -162,6 +166,19 @@ class DepthOptions(RunOptions):
     def __post_init__(self) -> None:
         if self.prior_map is not None and self.prior == "bundled":  # the default, which the map replaces
             object.__setattr__(self, "prior", "map")
+        alone = self.right is None and self.points is None and self.disparity is None
+        if (
+            alone
+            and (self.side_by_side or self.left.suffix.lower() in FILES_OF_BOTH)
+            and not self.left.is_dir()
+        ):
+            object.__setattr__(self, "right", self.left)
+
+    @property
+    def both_in_one(self) -> bool:
+        """Whether LEFT holds both views: as one picture, or as two pictures in one file."""
+        in_one = self.side_by_side or self.left.suffix.lower() in FILES_OF_BOTH
+        return in_one and self.right == self.left
 
     def photographs(self) -> dict[str, Path]:
         """Paths of the views of one pair by the name of their option, the left one first."""
@@ -220,7 +237,12 @@ class DepthOptions(RunOptions):
             refuse(f"--prior-map takes the place of a prior: leave out --prior {self.prior}.")
         if self.right is None and self.points is None and self.disparity is None:
             alone = "One photograph alone does not tell metres"
-            refuse(f"RIGHT is missing. {alone}: give a second view, or known depths by --points.")
+            spatial = f" {SPATIAL}" if self.left.suffix.lower() in (".heic", ".heif") else ""
+            refuse(f"RIGHT is missing. {alone}: give a second view, or known depths by --points.{spatial}")
+        if self.side_by_side and not self.both_in_one:
+            refuse("--side-by-side has both views in LEFT: leave out RIGHT, --points and --disparity.")
+        if self.both_in_one and "colmap" in self.export:
+            refuse("--export colmap needs an image file a view: cut the picture in two first.")
         views = len(self.view)
         for option, given, counts in (
             ("--view-E", self.view_e, {0 if self.estimate_pose else views}),
@@ -305,7 +327,7 @@ def check_files(options: DepthOptions, photographs: bool = True) -> None:
             with open_image(path, name):  # the head alone; the rest when it is read
                 pass
         for (first, a), (second, b) in itertools.combinations(views.items(), 2):
-            if a.samefile(b):
+            if a.samefile(b) and not (options.both_in_one and (first, second) == ("LEFT", "RIGHT")):
                 bad_value(second, f"another photograph than {first}", f"{b} for both")
     for name, path in options.other_files():
         model = any(os.path.exists(path / file) for file in (*MODEL_FILES, "images.bin"))

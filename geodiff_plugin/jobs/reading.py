@@ -23,7 +23,12 @@ from geodiff_plugin.evidence.prepare import cleaned
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
 from geodiff_plugin.formats.colmap import check_colmap_names
 from geodiff_plugin.formats.depth import depth_of_disparity, read_confidence, read_map
-from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov, warn_of_other_lens
+from geodiff_plugin.formats.images import (
+    intrinsics_from_exif,
+    intrinsics_from_fov,
+    picture_count,
+    warn_of_other_lens,
+)
 from geodiff_plugin.formats.lenses import (
     distortion_from_text,
     undistorted,
@@ -31,6 +36,7 @@ from geodiff_plugin.formats.lenses import (
     undistorted_points,
 )
 from geodiff_plugin.formats.reading import is_as_stored
+from geodiff_plugin.formats.recordings import both_halves
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
 from geodiff_plugin.jobs.options import PARAMETERS, DepthOptions, unique_names
 from geodiff_plugin.messages import Message
@@ -80,7 +86,12 @@ def read_pair(
     """
     views, config = options.photographs(), options.config()
     as_stored = bool(options.calib) and is_as_stored(options.calib)
-    images = list(frames or (_read_view(path, name, as_stored) for name, path in views.items()))
+    if frames is not None:
+        images = list(frames)
+    else:
+        first = _read_both(options, as_stored) if options.both_in_one else []
+        others = list(views.items())[len(first) :]
+        images = [*first, *(_read_view(path, name, as_stored) for name, path in others)]
     sizes = [(image.shape[1], image.shape[0]) for image in images]
     if options.estimate_pose:
         cameras = _cameras_without_poses(options, sizes)
@@ -146,9 +157,25 @@ def _posed_guidance(
     return guidance
 
 
-def _read_view(path: Path, name: str, as_stored: bool) -> np.ndarray:
+def _read_both(options: DepthOptions, as_stored: bool) -> list[np.ndarray]:
+    """Both views of the one file that LEFT names."""
+    if options.side_by_side:
+        return list(both_halves(_read_view(options.left, "LEFT", as_stored), "LEFT"))
+    count = picture_count(options.left, "LEFT")
+    if count != 2:
+        bad_value("LEFT", "an MPO file with two pictures, left one first", f"{count} in {options.left}")
+    left, right = (
+        _read_view(options.left, name, as_stored, page) for page, name in enumerate(("LEFT", "RIGHT"))
+    )
+    if left.shape != right.shape:
+        sizes = " and ".join("{1}x{0}".format(*view.shape) for view in (left, right))
+        bad_value("LEFT", "an MPO file with two pictures of one size", f"{sizes} in {options.left}")
+    return [left, right]
+
+
+def _read_view(path: Path, name: str, as_stored: bool, page: int = 0) -> np.ndarray:
     called = name if name in ("LEFT", "RIGHT") else f"--view {path}"
-    image, notes = read_image(path, called, as_stored=as_stored)
+    image, notes = read_image(path, called, as_stored=as_stored, page=page)
     for note in notes:
         warn(note)
     return image

@@ -202,3 +202,28 @@ def test_bench(monkeypatch, geodiff, prior):
     seconds, ratios = zip(*(map(float, words[1:]) for words in rows), strict=True)
     rounding = 0.02 + 0.006 / seconds[0]  # seconds are printed to a hundredth
     assert len(rows) == 2 and ratios == pytest.approx([each / seconds[0] for each in seconds], rel=rounding)
+
+
+def test_both_views_in_one_file_are_those_of_two_files(geodiff, command, textured_plane):
+    """An MPO of a stereo camera, and one picture with both views beside each other."""
+    left, right = (Image.fromarray(view) for view in (textured_plane.left, textured_plane.right))
+    left.save("both.mpo", save_all=True, append_images=[right], quality=95)
+    Image.fromarray(np.hstack([textured_plane.left, textured_plane.right])).save("beside.png")
+    rest = [*command[3:], *QUICK, "-q"]
+    for name, views in (
+        ("two", command[1:3]),
+        ("beside", ["beside.png", "--side-by-side"]),
+        ("mpo", ["both.mpo"]),
+    ):
+        answer = geodiff("depth", *views, *rest, "--out", name)
+        assert answer.code == 0, answer.err
+    two, beside = (np.load(f"{name}/depth.npy") for name in ("two", "beside"))
+    np.testing.assert_array_equal(two, beside)
+    with Image.open("both.mpo") as opened:  # what compression leaves of both
+        for number, name in enumerate(("l.png", "r.png")):
+            opened.seek(number)
+            opened.save(name)
+    assert geodiff("depth", "l.png", "r.png", *rest, "--out", "again").code == 0
+    np.testing.assert_array_equal(np.load("again/depth.npy"), np.load("mpo/depth.npy"))
+    answer = geodiff("depth", *command[1:3], "--side-by-side", *rest)
+    assert answer.code == 2 and "leave out RIGHT" in answer.err
