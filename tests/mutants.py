@@ -264,6 +264,14 @@ MUTANTS = [
         ("ahead[close, 2] * inverse_depth", "np.linalg.norm(ahead[close], axis=1) * inverse_depth"),
     ),
     *of(
+        "result/verdict.py",
+        ("math.isnan(found.spread) or found.spread >= LEAST_SPREAD", "found.spread >= LEAST_SPREAD"),
+        ("weak > 1", "weak > 2"),
+        ("0 < found.baseline_m < LEAST_BASELINE_M", "0 < found.baseline_m < 0.1 * LEAST_BASELINE_M"),
+        ("not trusted or found.at_end > MOST_AT_END", "found.at_end > MOST_AT_END"),
+        tests=(f"{UNIT}verdict.py",),
+    ),
+    *of(
         "pose/refine.py",
         ("+ misfit**2 + uneven**2", "+ misfit"),
         ("weight = of_length /", "weight = of_depth /"),

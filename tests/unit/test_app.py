@@ -259,6 +259,12 @@ class TestWithGradio:
         told = "the left photograph must be an image; got left.png. Give fx, or widen depth_range."
         assert for_visitors(said) == told
 
+    def test_a_sentence_of_the_page_has_its_code(self):
+        from geodiff_plugin.app.look import finished
+
+        shown = finished("not trusted", [], [("pose.inverse", "a < b")], "")
+        assert '<li data-code="pose.inverse">a &lt; b</li>' in shown
+
     def test_a_forgotten_result_leaves_no_files_and_no_maps(self, tmp_path):
         from geodiff_plugin.app.page import _forget
 
