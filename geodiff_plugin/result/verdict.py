@@ -205,11 +205,8 @@ def _why_disagreement(found: Indicators) -> str:
     few, unsure, unordered = _weaknesses(found)
     shares = [f"{100 * found.matched:.0f} % of the left image is matched"] if few else []
     shares += [f"the mean confidence is {found.confidence:.2f}"] if unsure else []
-    shares += (
-        [f"the rank correlation with the prior is {found.rank_correlation:.2f}"]
-        if unordered and not shares
-        else []
-    )
+    if unordered and not shares:
+        shares = [f"the rank correlation with the prior is {found.rank_correlation:.2f}"]
     return (
         f"The views hardly agree: {' and '.join(shares)}. Likely causes: E along the wrong axis or with a "
         "wrong rotation, images that are not rectified or whose lens is not corrected, K of another size, a "
