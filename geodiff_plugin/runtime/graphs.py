@@ -94,9 +94,11 @@ class GraphedForward:
 
     def _key(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """What calls that share a graph have in common; ``None`` where none can be used."""
-        if torch.is_grad_enabled() or not any(t.is_cuda for t in _tensors(list(args), kwargs)):
+        on_device = [tensor for tensor in _tensors(list(args), kwargs) if tensor.is_cuda]
+        if torch.is_grad_enabled() or not on_device:
             return None
         described: list[Any] = [torch.is_autocast_enabled("cuda"), torch.get_autocast_dtype("cuda")]
+        described.append(use_kernel(on_device[0]))  # the norms of a VAE
         for name, value in (*enumerate(args), *sorted(kwargs.items())):
             if isinstance(value, Tensor):
                 described.append((name, tuple(value.shape), value.stride(), value.dtype))
@@ -121,13 +123,8 @@ def _on(
 def _fast_group_norm(norm: torch.nn.GroupNorm, own: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     """The norm by a kernel where that is faster and no gradient is needed, else its own forward."""
     needs_gradient = torch.is_grad_enabled() and x.requires_grad
-    if (
-        needs_gradient
-        or x.dtype not in HALF
-        or not x.is_contiguous()
-        or not use_kernel(x)
-        or norm.weight is None
-    ):
+    suits = x.dtype in HALF and x.is_contiguous() and norm.weight is not None
+    if needs_gradient or not suits or not use_kernel(x):
         return own(x)
     from geodiff_plugin.runtime import kernels
 
@@ -135,11 +132,7 @@ def _fast_group_norm(norm: torch.nn.GroupNorm, own: Callable[[Tensor], Tensor], 
 
 
 class FasterNetworks:
-    """Graphs and norms of a pipeline's networks, in place within guided calls only.
-
-    Attributes:
-        pipe: a pipeline with a ``unet`` or a ``vae``, or both.
-    """
+    """Graphs and norms of a pipeline's ``unet`` and ``vae``, if any, in place within guided calls only."""
 
     def __init__(self, pipe: Any) -> None:
         self._graphs: dict[int, GraphedForward] = {}

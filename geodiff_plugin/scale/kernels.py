@@ -10,8 +10,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-#: Key of ``SPACES`` -> number of its formula in the kernel.
-FORMS = {"depth": 0, "disparity": 1, "log": 2, "log1p": 3, "sqrt_disparity": 4}
+from geodiff_plugin.scale.points import KERNEL_FORMS
+
 #: Matches of a program that are held at once, at least: fewer would compile another kernel for few matches.
 _LEAST_BLOCK = 1024
 #: Matches whose equations are summed at once, fewer than are searched for their median.
@@ -185,7 +185,7 @@ def refined_ends(
         torch.as_tensor(noise).float().reshape(1),
         count,
         *limits,
-        FORM=FORMS[space],
+        FORM=KERNEL_FORMS[space],
         BLOCK=block,
         CHUNK=CHUNK,
         num_warps=warps(block),

@@ -43,6 +43,8 @@ FIT_NOISE = 0.5
 FIT_FLOOR = 4e-3
 #: Width of the Cauchy weight, in standard deviations of match and map together.
 FIT_CAUCHY = 2.0
+#: Spaces whose formula the kernel of the fit has, and its number there; in another one the reference runs.
+KERNEL_FORMS = {"depth": 0, "disparity": 1, "log": 2, "log1p": 3, "sqrt_disparity": 4}
 #: Bound of the change of near in the fit, as a log factor: the fit must stay in its basin.
 NEAR_REACH = 1.4
 #: The same of far.
@@ -133,7 +135,7 @@ def refine_to_matches(
     lower = _ends(form, near_m / math.exp(NEAR_REACH), far_m / math.exp(FAR_REACH))
     upper = _ends(form, near_m * math.exp(NEAR_REACH), far_m * math.exp(FAR_REACH))
     bounds = torch.minimum(lower, upper), torch.maximum(lower, upper)
-    if use_kernel(values):
+    if use_kernel(values) and space in KERNEL_FORMS:
         from geodiff_plugin.scale import kernels
 
         limits = FIT_ITERATIONS, FIT_FLOOR, FIT_CAUCHY

@@ -27,6 +27,7 @@ from geodiff_plugin.matching import kernels as matching
 from geodiff_plugin.matching.census import MARGIN_PX, SIDE, VOTE_LEVELS
 from geodiff_plugin.runtime import kernels as runtime
 from geodiff_plugin.scale import kernels as scale
+from geodiff_plugin.scale.points import KERNEL_FORMS
 
 #: Compute capabilities of an A100 and of an H100.
 ARCHITECTURES = (80, 90)
@@ -85,7 +86,7 @@ def _of_the_networks() -> Iterator[Compiled]:
 def _of_the_scale() -> Iterator[Compiled]:
     refine = 9 * "*fp32 " + "i32 i32 fp32 fp32"
     for block in (1024, 16384):
-        sizes = {"FORM": scale.FORMS["depth"], "BLOCK": block, "CHUNK": scale.CHUNK}
+        sizes = {"FORM": KERNEL_FORMS["depth"], "BLOCK": block, "CHUNK": scale.CHUNK}
         yield Compiled(f"refinement, {block} matches", scale.refine_kernel, refine, sizes, scale.warps(block))
 
 

@@ -1,13 +1,12 @@
 """The kernel of the scale's refinement against its reference, ``scale.points.refine_to_matches``."""
 
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.scale.points import refine_to_matches
+from geodiff_plugin.scale.points import KERNEL_FORMS, refine_to_matches
 from geodiff_plugin.scale.space import SPACES
 
 
@@ -28,8 +27,16 @@ def random_matches(seed: int, space: str, size: tuple[int, int], device: torch.d
 
 
 def test_every_space_has_a_formula():
-    kernels = pytest.importorskip("geodiff_plugin.scale.kernels")
-    assert set(kernels.FORMS) == set(SPACES)
+    assert set(KERNEL_FORMS) == set(SPACES)
+
+
+def test_a_space_without_a_formula_runs_the_reference(device, monkeypatch):
+    x, matches = random_matches(0, "depth", (9, 9), device)
+    start = torch.tensor([1.0, 1.0], device=device), torch.tensor([6.0, 6.0], device=device)
+    monkeypatch.delitem(KERNEL_FORMS, "depth")
+    found = torch.stack(refine_to_matches(x, matches, *start, "depth"))
+    with without_kernels():
+        assert torch.equal(found, torch.stack(refine_to_matches(x, matches, *start, "depth")))
 
 
 @settings(max_examples=4, deadline=None)
