@@ -1,4 +1,4 @@
-"""Threads of torch on the CPU: never more than cores that this process may use.
+"""Threads: of torch on the CPU, never more than cores that this process may use; and ``Beside``.
 
 With twice as many threads as cores a guided call takes twice as long. torch does not count the CPU quota of a
 container, and takes any number from ``OMP_NUM_THREADS`` and ``torch.set_num_threads``. The number belongs to
@@ -7,10 +7,16 @@ the thread that calls. OpenCV's own, of the whole process, is left alone: more a
 
 from __future__ import annotations
 
+import contextvars
 import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Generic, TypeVar
 
 import cv2
 import torch
+
+T = TypeVar("T")
 
 
 def available_cores() -> int:
@@ -44,3 +50,39 @@ class WithinCores:
         before, self._before = self._before, None
         if before is not None and torch.get_num_threads() == self._capped:
             torch.set_num_threads(before)
+
+
+def leaves_cpu_free(device: torch.device) -> bool:
+    """Whether work on a device leaves the CPU free, so that work of the CPU beside it saves time."""
+    return device.type == "cuda"
+
+
+class Beside(Generic[T]):
+    """The answer of a function that a thread of its own works out while the caller goes on.
+
+    A guided call on CUDA makes its evidence like this, beside the network's first steps, which are not
+    guided; and in it the pose check, which keeps the CPU busy while the GPU matches. The thread has the
+    caller's context variables and stream, and takes no gradients. On other devices both would compete for
+    the same cores, so the function is called at once.
+    """
+
+    def __init__(self, function: Callable[[], T], device: torch.device) -> None:
+        self._pool = None
+        if not leaves_cpu_free(device):
+            answer = function()
+            self.result: Callable[[], T] = lambda: answer
+            return
+        context = contextvars.copy_context()
+        stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
+
+        def work() -> T:
+            with torch.no_grad(), torch.cuda.stream(stream):
+                return context.run(function)
+
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="geodiff-evidence")
+        self.result = self._pool.submit(work).result
+
+    def close(self) -> None:
+        """Wait until the thread has ended, whether its answer was asked for or not."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)

@@ -5,9 +5,14 @@ Source: S7.3 (the plane-sweep view of the g_s search); the matches are beyond it
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
+
 from torch import Tensor
 
 import geodiff_plugin.matching as matching
+from geodiff_plugin._checks import InputError
+from geodiff_plugin._threads import Beside, leaves_cpu_free
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.inputs import Inputs
@@ -16,7 +21,7 @@ from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.pose.refine import refine_views, untouched
 from geodiff_plugin.scale.points import RELIABLE, reliable_matches
-from geodiff_plugin.types import PosedViews, PoseReport
+from geodiff_plugin.types import CameraView, PosedViews, PoseReport
 
 
 def cleaned(image_01: Tensor, config: GuidanceConfig) -> Tensor:
@@ -37,12 +42,24 @@ def make_evidence(
         return prepare_evidence(native, points, config, needs_matches)
     left_01 = cleaned(native.left_01, config)
     views = [view._replace(image_01=cleaned(view.image_01, config)) for view in native.views]
+    posed = PosedViews(left_01, tuple(views), native.K_left)
     if config.pose == "given":
-        posed, report = untouched(views)
-    else:
-        posed, report = refine_views(left_01, views, native.K_left, given.unit, measured)
-    posed_views = PosedViews(left_01, tuple(posed), native.K_left)
-    return prepare_evidence(posed_views, points, config, needs_matches, report)
+        return prepare_evidence(posed, points, config, needs_matches, untouched(views)[1])
+
+    def checked() -> tuple[tuple[CameraView, ...], PoseReport]:
+        return refine_views(left_01, views, native.K_left, given.unit, measured)
+
+    check, as_given = Beside(checked, left_01.device), None
+    try:
+        if leaves_cpu_free(left_01.device):  # for the check; meanwhile, as most poses fit:
+            with suppress(InputError):  # said below, if it is not mended by a better pose
+                as_given = prepare_evidence(posed, points, config, needs_matches)
+        used, report = check.result()
+    finally:
+        check.close()
+    if as_given is not None and all(one is other for one, other in zip(used, views, strict=True)):
+        return replace(as_given, pose=report, warnings=distinct(report.warnings, as_given.warnings))
+    return prepare_evidence(posed._replace(views=tuple(used)), points, config, needs_matches, report)
 
 
 def prepare_evidence(

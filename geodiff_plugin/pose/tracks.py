@@ -6,6 +6,7 @@ They are matched by SIFT, and by optical flow once there is a first depth.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -274,12 +275,12 @@ def match_features(left: tuple[np.ndarray, np.ndarray], right: tuple[np.ndarray,
 
 def sparse_tracks(views: Sequence[GreyImage]) -> Tracks:
     """SIFT points of the left image with their matches in the right ones."""
-    (grey, K), *rights = views
-    left = sift_features(grey)
+    (_, K), *rights = views
+    with ThreadPoolExecutor(len(views)) as pool:  # most of their time is OpenCV's, outside of Python's lock
+        left, *of_rights = pool.map(sift_features, [grey for grey, _ in views])
     right_px = np.zeros((len(rights), len(left[0]), 2))
     seen = np.zeros(right_px.shape[:2], bool)
-    for v, (image, _) in enumerate(rights):
-        right = sift_features(image)
+    for v, right in enumerate(of_rights):
         of_left, of_right = match_features(left, right).T
         right_px[v, of_left], seen[v, of_left] = right[0][of_right, :2], True
     K_rights = np.stack([K_right for _, K_right in rights])

@@ -15,6 +15,7 @@ from tqdm.auto import tqdm
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, noted, refuse, warn
 from geodiff_plugin._kernels import without_kernels
+from geodiff_plugin._threads import Beside
 from geodiff_plugin.algorithm.prompt import depth_prompt
 from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.evidence.evidence import Evidence
@@ -25,7 +26,6 @@ from geodiff_plugin.priors import DepthPrior, prior_of
 from geodiff_plugin.priors.pipeline import RESAMPLING, DepthDiffusionPipeline
 from geodiff_plugin.result.ensemble import ensemble_metric
 from geodiff_plugin.result.output import image_labels
-from geodiff_plugin.runtime.beside import Beside
 from geodiff_plugin.runtime.estimate import ProcessingGrid, tiny_autoencoder
 from geodiff_plugin.runtime.graphs import FasterNetworks
 from geodiff_plugin.runtime.hooks import Exclusive, networks_of

@@ -289,6 +289,21 @@ def test_everything_downstream_sees_the_refined_pose(pair) -> None:
     assert np.allclose(np.linalg.inv(given.native.views[0][2].numpy()), wrong, atol=1e-5)
 
 
+@pytest.mark.parametrize(("turn_deg", "status"), [(0.0, "fits"), (0.8, "refined")])
+def test_evidence_made_beside_the_check_of_the_poses_is_the_same(pair, monkeypatch, turn_deg, status) -> None:
+    """As on CUDA: the views are matched as given meanwhile, and again if a pose is refined."""
+    E = pair.E.numpy() @ pose((turn_deg, -turn_deg, 0), (0, 0, 0))
+    guidance = GeometryGuidance(pair.right.image_01, (pair.K_left.numpy(), pair.K_right.numpy()), E)
+    left = pair.left.image_01.float()[None]
+    (alone,) = guidance.prepare(left)
+    for module in ("_threads", "evidence.prepare"):
+        monkeypatch.setattr(f"geodiff_plugin.{module}.leaves_cpu_free", lambda device: True)
+    (beside,) = guidance.prepare(left)
+    assert alone.pose.status == beside.pose.status == status and alone.warnings == beside.warnings
+    assert torch.equal(alone.matches.inverse_depth, beside.matches.inverse_depth)
+    assert torch.equal(alone.volume.levels, beside.volume.levels)
+
+
 @pytest.mark.parametrize("seed", [pytest.param(2, marks=pytest.mark.slow), 6])
 def test_the_rows_of_a_rig_that_has_drifted_agree_again(seed: int) -> None:
     """Its right camera has turned by 0.3 degrees, and its image has moved by 1.5 px."""
