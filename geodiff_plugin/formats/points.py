@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,23 @@ import numpy as np
 
 from geodiff_plugin._camera_checks import check_metres
 from geodiff_plugin._checks import bad_value, check_number
-from geodiff_plugin.formats.depth import MILLIMETRES, read_depth_png
+from geodiff_plugin.formats.depth import MILLIMETRES, PICTURES
 from geodiff_plugin.formats.files import PathLike, check_file, read_npy, read_rows
-from geodiff_plugin.formats.maps import read_pfm
+from geodiff_plugin.formats.maps import read_map_file
 
-KINDS = "a 16-bit PNG (mm), a .pfm or .npy map, or points as .npy, text or .ply, in metres"
+KINDS = (
+    "a map (16-bit PNG or TIFF in mm; float TIFF, .exr, .pfm, .npy or .npz in metres) or points in metres "
+    "(.npy, text, .ply, .pcd, .las)"
+)
+#: Letters of numpy's types for those of PCD.
+PCD_TYPES = {"F": "f", "U": "u", "I": "i"}
+#: What is not read, by suffix: what it is, and what makes points of it.
+FOREIGN = {
+    ".bin": (
+        "points of a lidar in its own frame (KITTI's velodyne)",
+        "Take them to the left camera's frame by calib_velo_to_cam and R_rect, and save them as .npy.",
+    ),
+}
 COLUMNS = (3, 4, 6)  # x y z, with an intensity, or with a colour
 NUMBER = re.compile(r"[-+]?(\d.*|\..*|nan|inf)", re.IGNORECASE)
 
@@ -31,12 +44,17 @@ def read_points(path: PathLike, name: str = "points", *, scale: float | None = N
     if scale is not None:
         check_number(scale, f"{name}-scale", 1e-9, 1e9)
     kind = file.suffix.lower()
-    if kind == ".png":
-        return read_depth_png(file, scale or MILLIMETRES, name)[0]
-    if kind == ".npy":
-        values = read_npy(file, name, KINDS)
-    else:
-        values = {".pfm": read_pfm, ".ply": read_ply_points}.get(kind, _table)(file, name)
+    if kind in FOREIGN:
+        bad_value(name, KINDS, f"{file}, {FOREIGN[kind][0]}", FOREIGN[kind][1])
+    if kind in PICTURES:
+        return _of_picture(file, name, scale)
+    readers: dict[str, Callable[[Path, str], np.ndarray]] = {
+        ".npy": lambda path, what: read_npy(path, what, KINDS),
+        **dict.fromkeys((".pfm", ".exr", ".npz"), read_map_file),
+        **dict.fromkeys((".las", ".laz"), read_las_points),
+        **{".ply": read_ply_points, ".pcd": read_pcd_points},
+    }
+    values = readers.get(kind, _table)(file, name)
     if values.ndim != 2 or 0 in values.shape:
         bad_value(name, "a map (H, W) or points (N, 3) of numbers", f"{file} of shape {values.shape}")
     if values.shape[1] in COLUMNS:
@@ -46,6 +64,61 @@ def read_points(path: PathLike, name: str = "points", *, scale: float | None = N
     with np.errstate(over="ignore"):
         values = (values / (scale or 1.0)).astype(np.float32)
     return values if values.shape[1] == 3 else np.where(np.isfinite(values), values, np.float32(0))
+
+
+def _of_picture(file: Path, name: str, scale: float | None) -> np.ndarray:
+    """The map of a PNG or TIFF: whole numbers are millimetres, floats metres, unless ``scale`` says else."""
+    values = read_map_file(file, name)
+    units = scale or (MILLIMETRES if values.dtype.kind in "iu" else 1.0)
+    known = np.isfinite(values) & (values > 0)
+    return np.where(known, values, 0).astype(np.float32) / np.float32(units)
+
+
+def read_pcd_points(path: Path, name: str = "points") -> np.ndarray:
+    """The known points ``(N, 3)`` of a PCD file, ASCII or binary, in the file's unit and frame.
+
+    Source: PCL's description of the format, version 0.7.
+    """
+    data, cure = path.read_bytes(), "Is it cut off, or another format?"
+    head = re.match(rb"[\s\S]{0,4000}?^DATA[ \t]+(\w+)[ \t]*\r?\n", data, re.MULTILINE)
+    if head is None:
+        bad_value(name, "a whole PCD file", path, cure)
+    lines = head.group().decode("ascii", errors="replace").splitlines()
+    entries = {words[0]: words[1:] for line in lines if (words := line.split()) and words[0][0] != "#"}
+    how = head.group(1).decode()
+    if how == "binary_compressed":
+        bad_value(name, "an uncompressed PCD file", path, "Run: pcl_convert_pcd_ascii_binary FILE out.pcd 1.")
+    try:
+        fields = entries["FIELDS"]
+        counts = [int(count) for count in entries.get("COUNT", ["1"] * len(fields))]
+        types = zip(entries["TYPE"], entries["SIZE"], strict=True)
+        kinds = [f"<{PCD_TYPES[kind]}{size}" for kind, size in types]
+        layout = np.dtype([(f, k, (n,)) for f, k, n in zip(fields, kinds, counts, strict=True)])
+        points, body = int(entries["POINTS"][0]), data[head.end() :]
+        if how == "binary":
+            rows = np.frombuffer(body, layout, points)
+            xyz = np.stack([rows[axis][:, 0] for axis in "xyz"], axis=1).astype(np.float64)
+        else:
+            starts = np.cumsum([0, *counts])[[fields.index(axis) for axis in "xyz"]]
+            xyz = np.array([line.split() for line in body.splitlines()[:points]], float)[:, starts]
+    except Exception:  # of any kind that a damaged file leads to
+        bad_value(name, "a whole PCD file with x, y and z", path, cure)
+    if len(xyz) != points:
+        bad_value(name, f"a PCD file with the {points} points of its head", f"{path} with {len(xyz)}", cure)
+    return xyz[np.isfinite(xyz).all(axis=1)]
+
+
+def read_las_points(path: Path, name: str = "points") -> np.ndarray:
+    """The points ``(N, 3)`` of a LAS file (LAZ with lazrs), in the file's unit and frame, by laspy."""
+    try:
+        import laspy
+    except ImportError:
+        cure = "Run: pip install 'laspy[lazrs]', or convert it: pdal translate FILE out.ply."
+        bad_value(name, KINDS, path, cure)
+    try:
+        return np.array(laspy.read(path).xyz, np.float64)
+    except Exception as error:  # of any kind that a damaged file leads to
+        bad_value(name, "a whole LAS file", f"{path} ({error})", "Is it cut off?")
 
 
 def _table(path: Path, name: str) -> np.ndarray:

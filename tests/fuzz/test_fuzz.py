@@ -87,6 +87,10 @@ def point_files() -> dict[str, bytes]:
         ".csv": ("x,y,z\n" + text.replace(" ", ",")).encode(),
         ".ply": (head.format("binary_little_endian") + "end_header\n").encode() + table.tobytes(),
         ".PLY": (head.format("ascii") + "end_header\n" + text + "\n").encode(),
+        ".pcd": (
+            b"VERSION 0.7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\nPOINTS 12\nDATA binary\n"
+            + table.tobytes()
+        ),
         ".pfm": b"Pf\n4 3\n-1.0\n" + table[:, 0].astype("<f4").tobytes(),
         ".png": image_bytes()["grey16.png"],
     }

@@ -22,6 +22,7 @@ from geodiff_plugin.formats import (
     read_calibration,
     read_depth_png,
     read_pfm,
+    read_points,
     write_colmap,
     write_depth_mm,
     write_depth_npy,
@@ -218,3 +219,54 @@ def test_a_model_of_many_images_is_read_without_its_points(tmp_path, monkeypatch
     (tmp_path / "images.txt").write_text(points)
     with pytest.raises(ValueError, match="calibration must be images.txt of a COLMAP model; got .* without"):
         read_calibration(tmp_path, **choice("colmap"))
+
+
+CLOUD = np.random.default_rng(3).uniform(0.5, 5.0, (20, 3))
+PCD_HEAD = (
+    "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 8 2\nTYPE F F F U\nCOUNT 1 1 1 1\n"
+    "WIDTH 21\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 21\nDATA {}\n"
+)
+
+
+def pcd(path: Path, how: str) -> None:
+    """The cloud and an unknown point, with an intensity between other columns' sizes."""
+    rows = np.vstack([CLOUD, [np.nan] * 3])
+    kind = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f8"), ("intensity", "<u2")])
+    table = np.array([(*row, 7) for row in rows], kind)
+    text = "\n".join(" ".join(map(repr, (*map(float, row), 7))) for row in rows)
+    body = table.tobytes() if how == "binary" else text.encode()
+    path.write_bytes(PCD_HEAD.format(how).encode() + body)
+
+
+def las(path: Path) -> None:
+    laspy = pytest.importorskip("laspy")
+    file = laspy.create()
+    file.header.scales = [1e-5] * 3
+    file.x, file.y, file.z = CLOUD.T
+    file.write(str(path))
+
+
+@pytest.mark.parametrize("kind", ["ascii.pcd", "binary.pcd", "a.las"])
+def test_points_of_other_programs(kind, tmp_path):
+    path = tmp_path / kind
+    las(path) if kind == "a.las" else pcd(path, path.stem)
+    np.testing.assert_allclose(read_points(path), CLOUD, atol=1e-4)
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(ValueError, match="points must be a (whole (PCD|LAS)|PCD) file"):
+        read_points(path)
+
+
+def test_what_points_are_not_read_names_what_converts_them(tmp_path):
+    (tmp_path / "000000.bin").write_bytes(bytes(160))
+    with pytest.raises(ValueError, match="KITTI's velodyne.*calib_velo_to_cam"):
+        read_points(tmp_path / "000000.bin")
+    (tmp_path / "c.pcd").write_bytes(PCD_HEAD.format("binary_compressed").encode())
+    with pytest.raises(ValueError, match="pcl_convert_pcd_ascii_binary"):
+        read_points(tmp_path / "c.pcd")
+
+
+@pytest.mark.parametrize(("kind", "units"), [("float32", 1.0), ("uint16", 1000.0)])
+def test_a_tiff_of_known_depths_is_a_map(kind, units, tmp_path):
+    depth = np.arange(12.0).reshape(3, 4) / 4
+    Image.fromarray((depth * units).astype(kind)).save(tmp_path / "d.tiff")
+    np.testing.assert_allclose(read_points(tmp_path / "d.tiff"), depth)
