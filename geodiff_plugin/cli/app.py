@@ -50,6 +50,7 @@ def _depth(options: DepthOptions) -> None:
         _imported("cli.run.run_many")(options, refs)
     else:
         options.refuse(["steady"], "{} needs frames in order: folders, a list, videos or a bag.")
+        options.refuse(["shard"], "{} divides many pairs: give folders, a list or videos.")
         options = with_folder(options, "geodiff-out")
         with start_pair(options) as folder:
             started = time.perf_counter()
@@ -107,6 +108,12 @@ class _Submit:
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Merge:
+    folder: Path = declare(MISSING, "The --out of geodiff depth --shard.", "", metavar="DIR")
+    json: bool = _out(False, "Print the rows as JSON instead of the table.")
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Page:
     prior: tuple[str, ...] = declare(
         ("bundled",), "Prior that visitors may choose; repeat it to offer several."
@@ -139,6 +146,7 @@ COMMANDS = {
     "info": Command(_Info, _later("cli.info.run_info"), "Show versions, devices and priors."),
     "bench": Command(PriorOptions, _later("cli.demo.run_bench"), "Measure how much time guidance adds."),
     "video": Command(_Video, _later("cli.results.run_video"), "Join the depth maps of frames into a video."),
+    "merge": Command(_Merge, _later("cli.results.run_merge"), "Join the tables of shards of many pairs."),
     "submit": Command(_Submit, _later("cli.results.run_submit"), "Write results for Middlebury or ETH3D."),
     "app": Command(_Page, _later("app.launch.run_app"), "Serve a page for measuring (extra 'app')."),
     "convert": Command(_Convert, _later("cli.results.run_convert"), "Make a folder for --prior of weights."),

@@ -1,10 +1,12 @@
-"""``geodiff video``, ``submit`` and ``convert``: the work, with its answer in a line."""
+"""``geodiff video``, ``merge``, ``submit`` and ``convert``: the work, with its answer in a line."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
+from geodiff_plugin.cli.run import answer_rows
+from geodiff_plugin.jobs.merge import merge_shards
 from geodiff_plugin.jobs.results import BENCHMARKS, write_submission, write_video
 from geodiff_plugin.jobs.telling import say
 from geodiff_plugin.priors.convert import convert_prior
@@ -16,6 +18,11 @@ def run_video(
     """Write the video and say how long it is."""
     seconds = write_video(frames, out, fps, near, far, overwrite)
     print(f"{len(frames)} frame{'s' * (len(frames) > 1)}, {seconds:.1f} s -> {out}")
+
+
+def run_merge(folder: Path, json: bool) -> None:
+    """Join the tables, and answer as the whole run would have."""
+    answer_rows(merge_shards(folder), folder, as_json=json)
 
 
 def run_submit(results: Sequence[Path], to: str, out: Path, method: str) -> None:

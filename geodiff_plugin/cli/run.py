@@ -21,7 +21,6 @@ from geodiff_plugin.jobs.pair import depth_pair
 from geodiff_plugin.jobs.pairs import PairRef
 from geodiff_plugin.jobs.records import JobLog
 from geodiff_plugin.jobs.report import report_text, summary_line
-from geodiff_plugin.jobs.runner import this_process
 from geodiff_plugin.jobs.telling import Tell, collected_warnings, say, silent
 from geodiff_plugin.types import UNTESTED
 
@@ -55,7 +54,7 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
     assert options.out is not None
     with collected_warnings():
         rows = depth_pairs(options, refs, tell=_tell(options), progress=not options.quiet)
-    _answer(rows, options, options.out)
+    answer_rows(rows, options.out, options.json, options.quiet)
 
 
 def run_bag(options: DepthOptions) -> None:
@@ -64,16 +63,15 @@ def run_bag(options: DepthOptions) -> None:
         result = depth_bag(options, tell=_tell(options), progress=not options.quiet)
     if not options.quiet:
         say(f"{result.path}: {result.images} depth images ({options.encoding}) of {len(result.rows)} pairs")
-    _answer(result.rows, options, result.frames)
+    answer_rows(result.rows, result.frames, options.json, options.quiet)
 
 
-def _answer(rows: Sequence[Row], options: DepthOptions, out: Path) -> None:
-    """Print it, and end with ``EXIT_SOME_FAILED`` where a pair failed."""
-    if this_process().index == 0:
-        if options.json:
-            print(json.dumps(rows, indent=2))
-        elif not options.quiet:
-            _show_rows(rows, out)
+def answer_rows(rows: Sequence[Row], out: Path, as_json: bool, quiet: bool = False) -> None:
+    """Print what became of pairs, and end with ``EXIT_SOME_FAILED`` where one failed."""
+    if as_json:
+        print(json.dumps(rows, indent=2))
+    elif not quiet:
+        _show_rows(rows, out)
     if any(row["result"] == "failed" for row in rows):
         sys.exit(EXIT_SOME_FAILED)
 
@@ -102,7 +100,12 @@ def run_capture(options: CaptureOptions) -> None:
     """
     with collected_warnings():
         report = depth_capture(options, tell=_tell(options), progress=not options.quiet)
-    print(json.dumps(report, indent=2) if options.json else summary(report, options.out))
+    if options.json:
+        print(json.dumps(report, indent=2))
+    elif options.poses_only:
+        print(f"poses {report['poses']['status']} -> {options.out}/")
+    else:
+        print(summary(report, options.out))
     if report["failed"] or (options.strict and report["not_trusted"]):
         sys.exit(EXIT_SOME_FAILED)
 

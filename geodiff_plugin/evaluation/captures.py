@@ -19,7 +19,7 @@ from geodiff_plugin.evaluation.experiment import Page, run_experiment
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.options import CAPTURE_ROWS, CaptureEvalOptions, CaptureRow
 from geodiff_plugin.evaluation.tables import CellOf, Table, grouped, mean_of, table_of_groups
-from geodiff_plugin.jobs.runner import Item, Record, fingerprint
+from geodiff_plugin.jobs.journal import Item, Record, fingerprint
 from geodiff_plugin.types import DepthFrame
 
 #: A point whose depth in the next frame differs by more than this share is hidden there, and counts not.

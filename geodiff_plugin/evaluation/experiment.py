@@ -1,6 +1,6 @@
 """An experiment: cells (samples x methods x settings), each measured and scored once, and its page of tables.
 
-The cells of every command are the items of one ``Runner``: all resume and are shared by several processes.
+The cells of every command are the items of one ``Runner``: all resume, and processes may share them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ from geodiff_plugin.evaluation.tables import Table
 from geodiff_plugin.formats import write_depth_npy
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import write_text
-from geodiff_plugin.jobs.runner import Item, Journal, Record, Runner, fingerprint, this_process
+from geodiff_plugin.jobs.journal import Item, Journal, Record, Shard, fingerprint
+from geodiff_plugin.jobs.runner import Runner
 from geodiff_plugin.matching import match_volume
 from geodiff_plugin.result.confidence import RIGHT_WITHIN
 from geodiff_plugin.runtime.machine import PeakMemory, versions
@@ -113,27 +114,39 @@ def run_experiment(
     remarks: Callable[[list[Record]], Sequence[str]] = lambda records: (),
     journal: str = "",
 ) -> Page | None:
-    """Measure the cells without a record, and write the page; ``None`` in any process but the first."""
+    """Measure the cells without a record, and write the page; ``None`` while other shards have cells left."""
     records = measure_cells(cells, options, journal or f"{command}.jsonl")
     return None if records is None else write_page(command, options, title, tables(records), remarks(records))
 
 
 def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NAME) -> list[Record] | None:
-    """The records of cells, in order, those of one key measured once; ``None`` as ``run_experiment``."""
-    runner = Runner(
-        list({cell.key: cell for cell in cells}.values()),
-        Journal(options.out / journal),
-        noun="cell",
-        survives=(OSError, ValueError) if getattr(options, "skip_broken", False) else (),
-        progress=not options.quiet,
-        whole=_has_map,
-    )
-    with warnings.catch_warnings():
+    """The records of cells, in order, those of one key measured once; ``None`` as ``run_experiment``.
+
+    Of several processes (``RANK``, ``WORLD_SIZE``) each takes every so many-th sample.
+    """
+    shard, every = Shard.of(None), list({cell.key: cell for cell in cells}.values())
+    samples = dict.fromkeys(_sample_of(cell) for cell in every)
+    mine = set(shard.part(list(samples)))
+    with Journal(options.out / journal, shard) as records, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Do not trust this depth")  # verdicts are in the records
-        records = {record["key"]: record for record in runner.run(lambda cell: cell.payload())}
-    if runner.process.index > 0:
+        runner = Runner(
+            [cell for cell in every if _sample_of(cell) in mine],
+            records,
+            noun="cell",
+            survives=(OSError, ValueError) if getattr(options, "skip_broken", False) else (),
+            progress=not options.quiet,
+            whole=_has_map,
+        )
+        own = {record["key"]: record for record in runner.run(lambda cell: cell.payload())}
+        made = {key: record for (key, _), record in records.read().items()} | own
+    if not all(cell.key in made for cell in every):
         return None
-    return [records[cell.key] | dict(cell.head) for cell in cells if cell.key in records]
+    return [made[cell.key] | dict(cell.head) for cell in cells]
+
+
+def _sample_of(cell: Item) -> str:
+    """What cells have in common that one process should measure, as it is read once for all of them."""
+    return str(cell.head.get("sample", cell.key))
 
 
 def out_of_view(sample: StereoSample) -> np.ndarray:
@@ -277,7 +290,7 @@ def _measure(
     ref: SampleRef, read: Any, method: Method, settings: Settings, priors: PriorCache, path: Path | None
 ) -> Record:
     """Run one method on one sample and score it; the seconds are those that the method takes alone."""
-    sample, process = read(ref), {"process": this_process().index}
+    sample, process = read(ref), {"process": Shard.of(None).index}
     priors.evidence.take_spared_seconds()
     start = time.perf_counter()
     try:
@@ -309,10 +322,10 @@ def method_cells(
 ) -> list[Item]:
     """A cell for every method on every sample, all of ``RECORDS_NAME``; with ``save_depth`` also maps."""
     # One sample, read once, serves all its methods.
-    process, priors, read = this_process(), PriorCache(), lru_cache(maxsize=1)(load)
-    several = process.count > 1
+    shard, priors, read = Shard.of(None), PriorCache(), lru_cache(maxsize=1)(load)
+    several = not shard.whole
     if several and settings.device == "cuda":
-        settings = replace(settings, device=f"cuda:{process.local % torch.cuda.device_count()}")
+        settings = replace(settings, device=f"cuda:{shard.local % torch.cuda.device_count()}")
     cells = []
     for ref, method in product(refs, map(find_method, methods)):
         chosen = method.adapted(settings)

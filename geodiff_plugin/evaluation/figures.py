@@ -30,7 +30,7 @@ from geodiff_plugin.evaluation.tables import ValueOf, count_of_pairs, grouped, h
 from geodiff_plugin.formats import as_image_01, atomic_path
 from geodiff_plugin.formats.out import write_text
 from geodiff_plugin.geometry import warp_right_to_left
-from geodiff_plugin.jobs.runner import Record
+from geodiff_plugin.jobs.journal import Record
 from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, grid, rasterised, ticks
 from geodiff_plugin.scale.space import SPACES, smooth_floor
 from geodiff_plugin.types import DepthFrame

@@ -20,7 +20,7 @@ from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, select
 from geodiff_plugin.evaluation.experiment import Page
 from geodiff_plugin.evaluation.options import PairsOptions
 from geodiff_plugin.evaluation.tables import Table, cell, count_of_pairs, mean_cell, pairs_of
-from geodiff_plugin.jobs.runner import Item, Record, this_process
+from geodiff_plugin.jobs.journal import Item, Record, Shard
 from geodiff_plugin.priors import PRIORS, find_prior
 
 
@@ -250,8 +250,8 @@ def fresh_process() -> ProcessPoolExecutor:
 
 def run_cost(name: str, options: PairsOptions) -> Page:
     """Measure ``COST_METHODS`` and further ones, and write the table; records go to ``out/cost``."""
-    if this_process().count > 1:
-        bad_value("the number of processes", "1 for cost", this_process().count)
+    if not Shard.of(None).whole:
+        bad_value("the number of processes", "1 for cost", Shard.of(None).count)
     refs = select(options)
     records, taken = list[Record](), dict[str, int | None]()
     alone = replace(options, out=options.out / "cost")

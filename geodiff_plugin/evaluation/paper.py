@@ -14,7 +14,7 @@ from geodiff_plugin.evaluation.experiment import Page
 from geodiff_plugin.evaluation.options import PairsOptions
 from geodiff_plugin.evaluation.pairs import CHANGES, changes_table, compare
 from geodiff_plugin.evaluation.tables import Table, count_of_pairs
-from geodiff_plugin.jobs.runner import Record
+from geodiff_plugin.jobs.journal import Record
 
 
 class Column(NamedTuple):

@@ -15,7 +15,7 @@ from geodiff_plugin.evaluation.datasets.sample import Numbers, changed_ref, two_
 from geodiff_plugin.evaluation.experiment import Page, run_experiment
 from geodiff_plugin.evaluation.options import PosesOptions
 from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs, headline, label_of
-from geodiff_plugin.jobs.runner import Item, Record
+from geodiff_plugin.jobs.journal import Item, Record
 
 #: An error above this is of the kind that a wrong scale makes, and must be said.
 BY_A_FACTOR = 0.25

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from geodiff_plugin.evaluation.baselines import find_method
-from geodiff_plugin.jobs.runner import Record
+from geodiff_plugin.jobs.journal import Record
 from geodiff_plugin.result.confidence import RIGHT_WITHIN
 
 #: Below this number of images there is no interval: resampling four values says nothing.

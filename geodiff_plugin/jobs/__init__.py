@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from geodiff_plugin.jobs.capture import depth_capture as depth_capture
     from geodiff_plugin.jobs.many import depth_pairs as depth_pairs
+    from geodiff_plugin.jobs.merge import merge_shards as merge_shards
     from geodiff_plugin.jobs.options import CaptureOptions as CaptureOptions
     from geodiff_plugin.jobs.options import DepthOptions as DepthOptions
     from geodiff_plugin.jobs.pair import depth_pair as depth_pair
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 _NAMES_OF = {
     "capture": "depth_capture",
     "many": "depth_pairs",
+    "merge": "merge_shards",
     "options": "CaptureOptions DepthOptions",
     "pair": "depth_pair run_pair write_pair",
     "pairs": "PairRef start_many",

@@ -43,6 +43,7 @@ def depth_bag(options: DepthOptions, *, tell: Tell = silent, progress: bool = Fa
     if out.suffix not in recordings.BAG_SUFFIXES or out.is_dir():
         expected = f"a file that ends in {' or '.join(recordings.BAG_SUFFIXES)}, as LEFT is a bag"
         bad_value("--out", expected, out)
+    options.refuse(["shard"], "{} cannot be used with a bag, which is written as one.")
     check_new_file(out, options.overwrite)
     pairs = recordings.list_pairs(options.left, topics, options.tolerance)
     frames = out.with_name(f"{out.stem}-frames")

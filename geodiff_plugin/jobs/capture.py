@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import multiprocessing
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
@@ -19,17 +18,18 @@ import psutil  # comes with accelerate
 import torch
 
 from geodiff_plugin import __version__
-from geodiff_plugin._checks import InputError, bad_value, check_positive, warn
+from geodiff_plugin._checks import InputError, bad_value, check_positive, refuse, warn
 from geodiff_plugin._threads import WithinCores, available_cores
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.capture.results import ALONE, save_alone, write_agreement, write_results
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
 from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, check_new, write_text
+from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard, fingerprint, shards_beside
 from geodiff_plugin.jobs.options import OF_SCALE, CaptureOptions
 from geodiff_plugin.jobs.prior import load_guided_prior
 from geodiff_plugin.jobs.report import messages_of, plain, single_map, verdict_report
-from geodiff_plugin.jobs.runner import BROKEN, Item, Journal, Runner, fingerprint, this_process
+from geodiff_plugin.jobs.runner import Runner
 from geodiff_plugin.jobs.telling import Tell, collected_warnings, say, silent
 from geodiff_plugin.jobs.writing import write_maps
 from geodiff_plugin.messages import Message, as_records
@@ -71,7 +71,10 @@ def solved_poses(capture: Capture, options: CaptureOptions, factor: float | None
     Returns metres per unit of the poses; ``factor`` passes in what another process found.
     """
     path, key = options.out / POSES_FILE, _key(capture, options, *OF_POSES)
-    solved = None if options.overwrite else load_solved(path, key)
+    shard = Shard.of(options.shard)
+    solved = None if options.overwrite and shard.whole else load_solved(path, key)
+    if solved is None and not shard.whole:
+        refuse("The poses are not solved yet: run geodiff capture with --poses-only first, then the shards.")
     if solved is None:
         solved = capture.solve(options.poses, threads=available_cores())
         _save_solved(path, solved, key)
@@ -207,54 +210,80 @@ def _run_frames(
     capture: Capture, options: CaptureOptions, names: Sequence[str], factor: float | None, progress: bool
 ) -> list[Record]:
     """Depth of every chosen frame that is not done yet, by one process a core; their reports in order."""
-    if options.overwrite and this_process().index == 0:  # the journal of all processes
-        (options.out / JOURNAL).unlink(missing_ok=True)
+    path, shard = options.out / JOURNAL, Shard.of(options.shard)
+    if options.overwrite:
+        for each in (path, *shards_beside(path).values()) if shard.whole else (shard.path(path),):
+            each.unlink(missing_ok=True)
     key = _key(capture, options, *OF_POSES, *OF_FRAME)
-    items, more = [Item(name, inputs=key) for name in names], list[Any]()
-    journal = Journal(options.out / JOURNAL)
-    left = sum(journal.get(item) is None for item in items)
-    journal.close()
-    on_cpu = pick_device(options.device).type == "cpu"
-    held = int(psutil.virtual_memory().available / PROCESS_BYTES)  # by the memory
-    wanted = options.processes or (min(available_cores(), max(1, held)) if on_cpu else 1)
-    count = max(1, min(wanted, left)) if this_process().count == 1 else 1
+    items = [Item(name, inputs=key) for name in names]
+    if not shard.whole:
+        return _work(capture, options, items, shard, progress)
+    with Journal(path) as journal:
+        count = _processes(options, sum(journal.get(item) is None for item in items))
+        if count > 1 and _in_processes(capture, options, items, factor, count, progress):
+            made = journal.read()
+            return [made[item.key, item.inputs] for item in items]
+    return _work(capture, options, items, shard, progress)  # all, or what a lost process has left
+
+
+def _in_processes(
+    capture: Capture,
+    options: CaptureOptions,
+    items: Sequence[Item],
+    factor: float | None,
+    count: int,
+    progress: bool,
+) -> bool:
+    """The frames by so many processes, a shard each, of which this is one; whether none was lost."""
+    context, more = multiprocessing.get_context("spawn"), list[Any]()
     for index in range(1, count):
-        arguments = (options, items, factor, index, count)
-        more.append(multiprocessing.get_context("spawn").Process(target=_help, args=arguments, daemon=True))
+        arguments = options, items, factor, Shard(index, count)
+        more.append(context.Process(target=_help, args=arguments, daemon=True))
         more[-1].start()
     try:
-        return _work(capture, options, items, count, progress)
+        _work(capture, options, items, Shard(0, count), progress)
+        for process in more:
+            process.join()
     finally:
         for process in more:
             process.terminate()
             process.join()
+    return all(process.exitcode == 0 for process in more)
+
+
+def _processes(options: CaptureOptions, left: int) -> int:
+    """How many processes work on so many frames: on a CPU one a core, as far as the memory goes."""
+    on_cpu = pick_device(options.device).type == "cpu"
+    held = int(psutil.virtual_memory().available / PROCESS_BYTES)
+    wanted = options.processes or (min(available_cores(), max(1, held)) if on_cpu else 1)
+    return max(1, min(wanted, left))
 
 
 def _work(
-    capture: Capture, options: CaptureOptions, items: Sequence[Item], count: int, progress: bool = False
+    capture: Capture, options: CaptureOptions, items: Sequence[Item], shard: Shard, progress: bool = False
 ) -> list[Record]:
-    """The part of the frames of one of ``count`` processes."""
-    runner = Runner(
-        items,
-        Journal(options.out / JOURNAL),
-        noun="frame",
-        survives=(InputError, OSError, ValueError, RuntimeError),
-        progress=progress,
-        whole=lambda item, _: all((options.out / item.key / f"{file}.npy").is_file() for file in ALONE),
-    )
-    with WithinCores(count):
+    """The frames of one of several processes; each has the cores that the others leave it."""
+    cores = WithinCores(1 if options.shard else shard.count)
+    with cores, Journal(options.out / JOURNAL, shard) as journal:
+        runner = Runner(
+            shard.part(items),
+            journal,
+            noun="frame",
+            survives=(InputError, OSError, ValueError, RuntimeError),
+            progress=progress,
+            whole=lambda item, _: all((options.out / item.key / f"{file}.npy").is_file() for file in ALONE),
+        )
         return runner.run(partial(_write_frame, capture, options, cache(partial(_pipe, options))))
 
 
-def _help(options: CaptureOptions, items: list[Item], factor: float | None, index: int, count: int) -> None:
-    """Another process of the same run, which takes frames that nobody has taken."""
-    os.environ.update(RANK=str(index), WORLD_SIZE=str(count), LOCAL_RANK="0")
+def _help(options: CaptureOptions, items: list[Item], factor: float | None, shard: Shard) -> None:
+    """Another process of the same run, with a part of its own."""
     options = replace(options, overwrite=False)
     with collected_warnings(silent):  # the first process has told them
         capture = open_capture(options)
         solved_poses(capture, options, factor)
     with collected_warnings(say):
-        _work(capture, options, items, count)
+        _work(capture, options, items, shard)
 
 
 def depth_capture(options: CaptureOptions, *, tell: Tell = silent, progress: bool = False) -> Record:
@@ -266,7 +295,8 @@ def depth_capture(options: CaptureOptions, *, tell: Tell = silent, progress: boo
         progress: whether a bar on stderr counts the frames.
 
     Returns:
-        The content of ``capture.json``; ``failed`` and ``not_trusted`` name frames.
+        The content of ``capture.json``; ``failed`` and ``not_trusted`` name frames. Of a shard, and with
+        ``options.poses_only``, only what there is by then.
 
     Raises:
         InputError: no capture, options that do not fit it, or no frame that got depth.
@@ -284,15 +314,18 @@ def depth_capture(options: CaptureOptions, *, tell: Tell = silent, progress: boo
     tell(f"poses {solved.status}: matches lie {solved.residual_px:.2f} px off their epipolar lines")
     for note in solved.notes:
         warn(note)
+    if options.poses_only:
+        return {"unit": capture.unit, "poses": _pose_report(capture)} | _outcome([])
     frames = _run_frames(capture, options, names, factor, progress)
+    outcome = _outcome(frames)
+    if not Shard.of(options.shard).whole:
+        return {"unit": capture.unit} | outcome
     seconds["frames"] = round(time.perf_counter() - started - seconds["poses"], 1)
-    failed = [report["key"] for report in frames if report.get("status") == BROKEN]
-    done = [name for name in names if name not in failed]
+    done = [name for name in names if name not in outcome["failed"]]
     if not done:
         raise InputError(f"No frame got depth: {frames[0]['error']}")
     agreement = write_agreement(capture, options.out, done)
-    doubted = [f["frame"] for f in frames if "verdict" in f and f["verdict"]["status"] != "trusted"]
-    files = write_results(capture, options.out, done, options.export, doubted)
+    files = write_results(capture, options.out, done, options.export, outcome["not_trusted"])
     seconds["agreement and cloud"] = round(time.perf_counter() - started - sum(seconds.values()), 1)
     report = {
         "version": __version__,
@@ -305,12 +338,19 @@ def depth_capture(options: CaptureOptions, *, tell: Tell = silent, progress: boo
         "agreement": agreement,
         "notes": capture.notes,
         "messages": as_records(capture.notes, solved.notes),
-        "failed": failed,
-        "not_trusted": doubted,
-        "frames": frames,
+        **outcome,
     }
     write_text(options.out / "capture.json", json.dumps(report, indent=2) + "\n")
     return report
+
+
+def _outcome(frames: list[Record]) -> Record:
+    """The reports of frames, and the names of those that failed or are not trusted."""
+    return {
+        "failed": [report["key"] for report in frames if report.get("status") == BROKEN],
+        "not_trusted": [f["frame"] for f in frames if "verdict" in f and f["verdict"]["status"] != "trusted"],
+        "frames": frames,
+    }
 
 
 def _pose_report(capture: Capture) -> Record:

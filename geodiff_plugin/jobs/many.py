@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import errno
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -20,8 +19,9 @@ from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.formats import recordings
 from geodiff_plugin.formats.files import file_digest
-from geodiff_plugin.formats.out import OutFolder, atomic_path, reason_of
+from geodiff_plugin.formats.out import OutFolder, reason_of
 from geodiff_plugin.formats.reading import has_pose_per_image
+from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard
 from geodiff_plugin.jobs.options import DepthOptions, start_pair
 from geodiff_plugin.jobs.pair import run_pair, write_pair
 from geodiff_plugin.jobs.pairs import COLUMNS, SUMMARY, PairRef, options_of
@@ -29,17 +29,18 @@ from geodiff_plugin.jobs.prior import prior_of_options
 from geodiff_plugin.jobs.reading import PairInputs, read_pair
 from geodiff_plugin.jobs.records import JobLog, PairRun
 from geodiff_plugin.jobs.report import read_report
-from geodiff_plugin.jobs.runner import BROKEN, Item, Journal, Runner
+from geodiff_plugin.jobs.runner import Runner
 from geodiff_plugin.jobs.steady import write_steady_frames
+from geodiff_plugin.jobs.tables import write_table
 from geodiff_plugin.jobs.telling import Tell, silent
 from geodiff_plugin.options import flag_of
 from geodiff_plugin.runtime.machine import pick_device
 
-#: What became of every pair, as it is known to all processes of a run.
+#: What became of every pair.
 JOURNAL = ".pairs.jsonl"
 #: Options that a result does not depend on.
 NOT_OF_THE_RESULT = {
-    *("out", "overwrite", "quiet", "json", "strict", "steady"),
+    *("out", "overwrite", "quiet", "json", "strict", "steady", "shard"),
     *("device", "graphs", "no_kernels", "encoding"),
 }
 #: With one of these causes the next pair cannot be written either.
@@ -245,7 +246,8 @@ def depth_pairs(
 ) -> list[Row]:
     """What ``geodiff depth`` does with many pairs: a folder each below ``options.out``, and ``pairs.csv``.
 
-    Finished pairs of an earlier run are kept; a pair that fails is a row, and the others go on.
+    Finished pairs of an earlier run are kept; a pair that fails is a row, and the others go on. A shard
+    (``options.shard``) works on its part alone, and has a table of its own, ``pairs.I-of-N.csv``.
 
     Args:
         options: of the command, with ``out``.
@@ -261,9 +263,30 @@ def depth_pairs(
     """
     assert options.out is not None
     _refuse_one_length(options, refs)
-    device, _ = pick_device(options.device), options.config()
-    journal, there = Journal(options.out / JOURNAL), dict[str, Row]()
-    items = [Item(r.name, r, words=(str(r.left), str(r.right), str(options.out / r.name))) for r in refs]
+    shard, device, _ = Shard.of(options.shard), pick_device(options.device), options.config()
+    if device.type == "cuda" and device.index is None:
+        device = torch.device("cuda", shard.local % torch.cuda.device_count())
+    if options.steady and not shard.whole:
+        refuse("--steady needs all frames: run the shards without it, then the whole with it.")
+    refs = shard.part(refs)
+    with Journal(options.out / JOURNAL, shard) as journal:
+        items = [Item(r.name, r, words=(str(r.left), str(r.right), str(options.out / r.name))) for r in refs]
+        there = _rows_there(items, options, journal)
+        runner = Runner(items, journal, noun="pair", survives=(Exception,), progress=progress)
+        records = _through(Stages(options, device, tell=tell), runner)
+        rows = [_final(record, there.get(record["key"]), options, tell) for record in records]
+        write_table(shard.path(options.out / SUMMARY), rows, tell)
+        if options.steady:
+            failed = {row["pair"] for row in rows if row["result"] == "failed"}
+            with closing(Views(options)) as views:
+                whole = [ref for ref in refs if ref.name not in failed]
+                write_steady_frames(options, whole, views.of, tell)
+    return rows
+
+
+def _rows_there(items: Sequence[Item], options: DepthOptions, journal: Journal) -> dict[str, Row]:
+    """Rows of the pairs that an earlier run has finished, by name; records of all others do not count."""
+    there = dict[str, Row]()
     for item in items:
         row = None if options.overwrite else finished_row(options_of(item.payload, options))
         if row is None:
@@ -272,21 +295,7 @@ def depth_pairs(
         there[item.key] = row
         if journal.get(item) is None:
             journal.put(item, row)
-    runner = Runner(items, journal, noun="pair", survives=(Exception,), progress=progress)
-    process = runner.process
-    if device.type == "cuda" and device.index is None:
-        device = torch.device("cuda", process.local % torch.cuda.device_count())
-    stages = Stages(options, device, tell=tell if process.index == 0 else silent)
-    records = _through(stages, runner)
-    rows = [_final(record, there.get(record["key"]), options, tell) for record in records]
-    if process.index == 0:
-        _write_table(options.out / SUMMARY, rows, tell)
-        if options.steady:
-            failed = {row["pair"] for row in rows if row["result"] == "failed"}
-            with closing(Views(options)) as views:
-                whole = [ref for ref in refs if ref.name not in failed]
-                write_steady_frames(options, whole, views.of, tell)
-    return rows
+    return there
 
 
 def _through(stages: Stages, runner: Runner) -> list[Row]:
@@ -322,13 +331,3 @@ def _final(record: Row, there: Row | None, options: DepthOptions, tell: Tell) ->
     tell(f"geodiff: {record['key']}: {reason}")  # --strict: it has failed
     told = {"pair": record["key"], "result": "failed", "message": reason, "codes": record.get("codes")}
     return dict.fromkeys(COLUMNS) | told
-
-
-def _write_table(out: Path, rows: Sequence[Row], tell: Tell) -> None:
-    try:
-        with atomic_path(out) as path, open(path, "w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            writer.writeheader()
-            writer.writerows(rows)
-    except OSError as error:  # what became of the pairs is told, and each result is in its folder
-        tell(f"geodiff: {out} could not be written ({reason_of(error)}).")

@@ -156,6 +156,9 @@ class DepthOptions(RunOptions):
         "Also write glb (point cloud), mesh (textured GLB) or colmap (sparse model); repeatable.",
         choices=("glb", "mesh", "colmap"),
     )
+    shard: str | None = _output(
+        None, "Of many pairs: do part I of N, from 0/N on; geodiff merge joins the tables.", metavar="I/N"
+    )
     quiet: bool = _output(False, "Show no progress bar and no summary.", "--quiet", "-q")
     graphs: bool = declare(
         False, "Networks as CUDA graphs, and a faster group norm in half precision (on for many pairs)."
@@ -395,6 +398,12 @@ class CaptureOptions(PriorOptions):
         None, "Take another model's depth maps as the prior: a folder with NAME.npy for each frame."
     )
     processes: int | None = declare(None, "Number of processes (default: one per core).", low=1, high=1024)
+    poses_only: bool = _output(False, "Only solve the poses; runs with --shard then start from them.")
+    shard: str | None = _output(
+        None,
+        "Do part I of N of the frames, from 0/N on; the same command without it then joins them.",
+        metavar="I/N",
+    )
     export: tuple[str, ...] = _output(
         (),
         "Also write colmap (dense workspace) or mesh (TSDF fusion, needs Open3D); repeatable.",

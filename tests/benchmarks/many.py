@@ -21,11 +21,12 @@ import torch
 from PIL import Image
 
 from geodiff_plugin.cli.terminal import new_table, show
+from geodiff_plugin.jobs.journal import Item, Journal
 from geodiff_plugin.jobs.many import Stages
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import start_many
 from geodiff_plugin.jobs.prior import load_guided_prior
-from geodiff_plugin.jobs.runner import Item, Journal, Runner
+from geodiff_plugin.jobs.runner import Runner
 from geodiff_plugin.runtime.machine import pick_device
 from tests.scenes import render_pair
 
@@ -98,10 +99,11 @@ class ManyPairs:
         steps = [stages.read, stages.evidence, stages.guide, stages.write]
         with tempfile.TemporaryDirectory() as folder, closing(stages):
             items = [Item(ref.name, ref) for ref in self._refs]
-            runner = Runner(items, Journal(Path(folder) / "pairs.jsonl"), progress=False)
-            clock, cores = time.perf_counter(), time.process_time()
-            runner.run(*steps, release=stages.release, most=most)
-            return time.perf_counter() - clock, time.process_time() - cores
+            with Journal(Path(folder) / "pairs.jsonl") as journal:
+                runner = Runner(items, journal, progress=False)
+                clock, cores = time.perf_counter(), time.process_time()
+                runner.run(*steps, release=stages.release, most=most)
+                return time.perf_counter() - clock, time.process_time() - cores
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Many pairs in one run: folders, lists and videos; overlap, resumption, failures, several processes."""
+"""Many pairs in one run: folders, lists and videos; overlap, resumption, failures, shards."""
 
 import csv
 import errno
@@ -217,6 +217,35 @@ def test_a_full_disk_ends_the_run_and_keeps_what_is_finished(geodiff, fresh, mon
     monkeypatch.setattr(many, "write_pair", write)
     answer = geodiff(*COMMAND)
     assert answer.code == 0 and "0 failed" in answer.out and "0 there" not in answer.out
+
+
+# Shards
+
+
+def test_shards_in_turn_give_what_the_whole_run_gives_and_merge_joins_their_tables(geodiff, fresh, made):
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    assert geodiff(*COMMAND, "-q", "--shard", "0/2").code == 0
+    answer = geodiff("merge", "out")
+    assert answer.code == 2 and "Shards have no table yet: run --shard 1/2." in answer.err
+    answer = geodiff(*COMMAND, "--shard", "1/2")
+    torch.set_num_threads(threads)
+    assert answer.code == 0 and "1 pair: 1 done" in answer.out
+    answer = geodiff("merge", "out")
+    assert answer.code == 0 and "3 pairs: 3 done" in answer.out
+    assert [row["pair"] for row in rows_of()] == ["a", "b", "c"]
+    for name in "abc":
+        of_whole = np.load(made / "out" / name / "depth.npy")
+        np.testing.assert_array_equal(np.load(f"out/{name}/depth.npy"), of_whole)
+    answer = geodiff(*COMMAND)
+    assert "0 done, 3 there already" in answer.out
+
+
+def test_what_shards_cannot_do_is_said(geodiff, fresh):
+    assert "--shard divides many pairs" in geodiff("depth", "left/a.png", "right/a.png", "--shard", "0/2").err
+    assert "--shard must be I/N" in geodiff(*COMMAND, "--shard", "2/2").err
+    assert "--steady needs all frames" in geodiff(*COMMAND, "--shard", "0/2", "--steady").err
+    assert "holds no table of a shard" in geodiff("merge", "left").err
 
 
 # Videos

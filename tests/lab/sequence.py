@@ -21,7 +21,7 @@ from geodiff_plugin.evaluation.experiment import Page, run_experiment
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, most_of, table_of_groups
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.jobs.runner import Item, Record, fingerprint
+from geodiff_plugin.jobs.journal import Item, Record, fingerprint
 from geodiff_plugin.types import DepthFrame
 from tests.lab.options import WAYS, SequenceOptions
 from tests.scenes import SyntheticSequence, render_sequence

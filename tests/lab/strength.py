@@ -28,7 +28,7 @@ from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, data_of,
 from geodiff_plugin.evaluation.experiment import DENSE, Page, cell_key, in_metres, run_experiment
 from geodiff_plugin.evaluation.metrics import evaluate_depth, filled, to_space
 from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, method_title, most_of
-from geodiff_plugin.jobs.runner import Item, Record
+from geodiff_plugin.jobs.journal import Item, Record
 from geodiff_plugin.priors import prior_of
 from geodiff_plugin.runtime.noise_levels import noise_level
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance

@@ -23,7 +23,7 @@ from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, find_pai
 from geodiff_plugin.evaluation.experiment import Page, run_experiment
 from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.jobs.runner import Item, Record
+from geodiff_plugin.jobs.journal import Item, Record
 from geodiff_plugin.types import DepthFrame
 from tests.lab.options import TrustOptions
 

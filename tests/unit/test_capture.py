@@ -356,6 +356,27 @@ def test_a_frame_that_fails_is_named_and_the_rest_is_kept(model, tmp_path, monke
     assert (tmp_path / "out/f04/depth.npy").is_file()
 
 
+def test_shards_start_from_poses_that_were_solved_once_and_the_whole_joins_them(model, tmp_path, monkeypatch):
+    options, write, written = replace(model(), overwrite=False), run._write_frame, list[str]()
+
+    def noting(capture, options, loaded, item):
+        written.append(item.key)
+        return write(capture, options, loaded, item)
+
+    monkeypatch.setattr(run, "_write_frame", noting)
+    with pytest.raises(InputError, match="poses are not solved yet: run geodiff capture with --poses-only"):
+        run.depth_capture(replace(options, shard="0/2"))
+    assert run.depth_capture(replace(options, poses_only=True))["frames"] == [] == written
+    monkeypatch.setattr(SOLVE, lambda *_, **__: pytest.fail("solved before"))
+    for shard, frames in (("1/2", ["f04"]), ("0/2", ["f02", "f06"])):
+        report = run.depth_capture(replace(options, shard=shard))
+        assert [frame["frame"] for frame in report["frames"]] == frames
+    assert written == ["f04", "f02", "f06"] and not (tmp_path / "out/cloud.ply").exists()
+    report = run.depth_capture(options)
+    assert [frame["frame"] for frame in report["frames"]] == ["f02", "f04", "f06"] and len(written) == 3
+    assert report["files"]["cloud_points"] > 0
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

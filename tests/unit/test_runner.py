@@ -1,24 +1,26 @@
-"""Jobs that are resumed, shared, killed and that fail."""
+"""Jobs that are resumed, divided into shards, killed and that fail."""
 
-import json
-import os
 import signal
 import subprocess
 import sys
 import threading
 import time
 from collections import Counter
+from contextlib import ExitStack
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geodiff_plugin.jobs.runner import BROKEN, Item, Journal, Runner, fingerprint
+from geodiff_plugin import InputError
+from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard, fingerprint
+from geodiff_plugin.jobs.runner import Runner
 
 CHILD = """
 import sys, time
 from pathlib import Path
-from geodiff_plugin.jobs.runner import Item, Journal, Runner
+from geodiff_plugin.jobs.journal import Item, Journal
+from geodiff_plugin.jobs.runner import Runner
 
 out, pause, stages = Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
 
@@ -38,8 +40,9 @@ ALL = Counter(f"item{n}" for n in range(8))
 def go(folder, work, count=4, stages=1, release=None, **keywords):
     """The records of a run of ``work`` in one stage, or behind others that hand an item on."""
     items = [Item(f"item{n}", n) for n in range(count)]
-    runner = Runner(items, Journal(folder / "job.jsonl"), progress=False, **keywords)
-    return runner.run(*[lambda item: item] * (stages - 1), work, release=release)
+    with Journal(folder / "job.jsonl") as journal:
+        runner = Runner(items, journal, progress=False, **keywords)
+        return runner.run(*[lambda item: item] * (stages - 1), work, release=release)
 
 
 @pytest.mark.parametrize("stages", [1, 3])
@@ -55,6 +58,7 @@ def test_a_second_run_does_what_is_missing(tmp_path, stages):
     assert calls == [0, 1, 2, 3, 4] and [path.name for path in tmp_path.iterdir()] == ["job.jsonl"]
 
 
+@settings(deadline=None)  # the disk is written to
 @given(
     cut=st.integers(0, 200), extra=st.sampled_from([b"", b'{"key": "item', b"\xff\xfe", b"[1]\n", b"\n\n"])
 )
@@ -79,8 +83,9 @@ def test_changed_inputs_and_lost_files_are_made_again(tmp_path):
 
     def run(whole=None):
         item = Item("pair", inputs=fingerprint({"picture": picture}, "0.1.0"))
-        runner = Runner([item], Journal(tmp_path / "job.jsonl"), progress=False, whole=whole)
-        return runner.run(lambda i: calls.append(i) or {})[0]["inputs"]
+        with Journal(tmp_path / "job.jsonl") as journal:
+            runner = Runner([item], journal, progress=False, whole=whole)
+            return runner.run(lambda i: calls.append(i) or {})[0]["inputs"]
 
     found = []
     for content, made in (("old", 1), ("old", 1), ("another", 2), ("old", 2)):
@@ -138,36 +143,75 @@ def test_stages_work_side_by_side_and_let_go_of_every_item(tmp_path):
     assert len((tmp_path / "job.jsonl").read_bytes().splitlines()) == 2
 
 
-def start(folder, pause=0.05, stages=1, **environment):
+def start(folder, pause=0.05, stages=1):
     words = [sys.executable, "-c", CHILD, str(folder), str(pause), str(stages)]
-    return subprocess.Popen(words, stdout=subprocess.PIPE, env=os.environ | environment, text=True)
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def begun(folder):
     return Counter((folder / "begun").read_text().split()) if (folder / "begun").exists() else Counter()
 
 
-@pytest.mark.parametrize(("stages", "launched"), [(1, True), (2, False)])
-def test_processes_share_a_job(tmp_path, stages, launched):
-    launcher = [{"RANK": str(i), "WORLD_SIZE": "2"} if launched else {} for i in range(2)]
-    processes = [start(tmp_path, stages=stages, **environment) for environment in launcher]
-    counts = [int(process.communicate(timeout=60)[0]) for process in processes]
-    assert counts[0] == 8 and (launched or counts[1] == 8)
-    assert begun(tmp_path) == ALL
-
-
-def test_what_a_killed_process_had_begun_is_taken_over(tmp_path):
-    victim = start(tmp_path, pause=60, RANK="1", WORLD_SIZE="2")
+@pytest.mark.skipif(sys.platform == "win32", reason="files are not locked there")
+def test_a_second_run_in_the_same_folder_is_refused_and_goes_on_when_the_first_was_killed(tmp_path):
+    first = start(tmp_path, pause=60)
     while not begun(tmp_path):
         time.sleep(0.05)
-    first = start(tmp_path, RANK="0", WORLD_SIZE="2")
-    while sum(begun(tmp_path).values()) < 8:
-        time.sleep(0.05)
-    time.sleep(0.5)
-    assert first.poll() is None  # it waits for the item that the other one has
-    victim.send_signal(signal.SIGKILL)
-    victim.communicate()
-    assert first.communicate(timeout=60)[0] == "8\n"
-    assert begun(tmp_path) == ALL + Counter(["item4"])
-    records = [json.loads(line) for line in (tmp_path / "job.jsonl").read_text().splitlines()]
-    assert sorted(record["square"] for record in records) == [n**2 for n in range(8)]
+    with pytest.raises(InputError, match=f"Another run works in {tmp_path}: wait for it"):
+        Journal(tmp_path / "job.jsonl")
+    first.send_signal(signal.SIGKILL)
+    first.communicate()
+    assert start(tmp_path).communicate(timeout=60)[0] == "8\n"
+    assert begun(tmp_path) == ALL + Counter(["item0"])
+
+
+def test_shards_do_every_so_many_th_item_at_once_and_the_whole_finds_them_done(tmp_path):
+    calls, items = [], [Item(f"item{n}", n) for n in range(8)]
+    with ExitStack() as stack:
+        shards = [Shard(index, 3) for index in range(3)]
+        journals = [stack.enter_context(Journal(tmp_path / "job.jsonl", shard)) for shard in shards]
+        for shard, journal in zip(shards, journals, strict=True):
+            runner = Runner(shard.part(items), journal, progress=False)
+            records = runner.run(lambda item: calls.append(item.payload) or {"square": item.payload**2})
+            assert [r["key"] for r in records] == [f"item{n}" for n in range(shard.index, 8, 3)]
+    assert calls == [0, 3, 6, 1, 4, 7, 2, 5]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"job.{n}-of-3.jsonl" for n in range(3)]
+    assert [r["square"] for r in go(tmp_path, lambda item: pytest.fail("done before"), 8)] == [
+        n**2 for n in range(8)
+    ]
+
+
+def test_a_failure_of_a_shard_is_tried_again_and_does_not_hide_what_was_made_since(tmp_path):
+    def failing(item):
+        raise OSError("no camera")
+
+    def run(work, *shard):
+        with Journal(tmp_path / "job.jsonl", *shard) as journal:
+            Runner([Item("item0", 0)], journal, survives=(OSError,), progress=False).run(work)
+            return journal.read()
+
+    assert run(failing, Shard(0, 2))["item0", ""]["status"] == BROKEN
+    assert run(lambda item: {"status": "ok"})["item0", ""]["status"] == "ok"
+
+
+@pytest.mark.parametrize(
+    ("typed", "environment", "expected"),
+    [
+        ("2/8", {}, Shard(2, 8)),
+        (None, {}, Shard(0, 1)),
+        (None, {"RANK": "1", "WORLD_SIZE": "4"}, Shard(1, 4)),
+        ("0/2", {"RANK": "1", "WORLD_SIZE": "4"}, Shard(0, 2)),
+    ],
+)
+def test_a_shard_is_typed_or_told_by_the_launcher(monkeypatch, typed, environment, expected):
+    for name in ("RANK", "WORLD_SIZE"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert Shard.of(typed) == expected
+
+
+@pytest.mark.parametrize("typed", ["8/8", "1", "-1/3", "1/0", "a/b", ""])
+def test_what_is_no_shard_is_refused(typed):
+    with pytest.raises(InputError, match="--shard must be I/N"):
+        Shard.of(typed)

@@ -19,7 +19,7 @@ from geodiff_plugin.config import FAST, PAPER, PRIOR_FIT, GuidanceConfig, config
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.store import EvidenceStore
-from geodiff_plugin.jobs.runner import fingerprint
+from geodiff_plugin.jobs.journal import fingerprint
 from geodiff_plugin.priors import load_prior, prior_of
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import no_bars
