@@ -93,7 +93,9 @@ def read_capture(
     if tracked:
         finished = [each if each.frame.E is not None else _left_out(each, NO_POSE) for each in finished]
     frames = [each.frame for each in finished if not each.problem]
-    notes = [*_reasons(finished), *(layout.notes if K is None and fov is None else ()), *_turned(frames)]
+    is_typed = K is not None or fov is not None
+    said = [note for note in layout.notes if not (is_typed and note.code == "capture.assumed-k")]
+    notes = [*_reasons(finished), *said, *_turned(frames)]
     if len(frames) < 2:
         alone = "One frame has no second view: use geodiff depth with known points, or record more."
         bad_value("a capture", "at least two frames", f"{len(frames)} in {source}", " ".join(notes) or alone)

@@ -25,7 +25,15 @@ from geodiff_plugin.formats.clouds import Cloud
 from geodiff_plugin.formats.files import PathLike, check_file, read_text
 from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout, image_folders
 from geodiff_plugin.formats.out import atomic_path
-from geodiff_plugin.formats.rigs import Camera, CameraChoice, array_of, intrinsics, make_rig, names_of_pair
+from geodiff_plugin.formats.rigs import (
+    Camera,
+    CameraChoice,
+    array_of,
+    intrinsics,
+    make_rig,
+    names_of_pair,
+    pose_of,
+)
 from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Rig
 
@@ -92,11 +100,17 @@ FEWEST_VIEWS, MOST_ERROR_PX = 3, 1.5
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image of a model: its number, ``(4, 4)`` T_camera_from_world, its camera's number."""
+    """An image of a model: its number, quaternion and translation as text, its camera's number."""
 
     number: int
-    T: np.ndarray
+    words: str
     camera: int
+
+    @property
+    def T(self) -> np.ndarray:
+        """``(4, 4)`` T_camera_from_world; an error where the numbers are none of a pose."""
+        qw, qx, qy, qz, *place = array_of(self.words.split(), (7,), f"image {self.number}")
+        return pose_of(Rotation.from_quat([qx, qy, qz, qw]), place)  # refuses zeros
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,14 +212,10 @@ def _camera(number: str, name: str, size: tuple[int, int], words: str) -> Camera
 
 
 def _images(text: str) -> dict[str, PosedImage]:
-    images = {}
-    for number, words, camera, name in IMAGE.findall(text):
-        qw, qx, qy, qz, *translation = array_of(words.split(), (7,), f"image {number}")
-        T = np.eye(4)
-        T[:3, :3] = Rotation.from_quat([qx, qy, qz, qw]).as_matrix()  # refuses zeros
-        T[:3, 3] = translation
-        images[name.strip()] = PosedImage(int(number), T, int(camera))
-    return images
+    return {
+        name.strip(): PosedImage(int(number), words, int(camera))
+        for number, words, camera, name in IMAGE.findall(text)
+    }
 
 
 def _model(cameras_text: str, images_text: str) -> Model:

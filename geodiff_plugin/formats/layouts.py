@@ -110,7 +110,8 @@ class Images:
 
     def __init__(self, names: Sequence[str], folders: Sequence[Path], project: Path) -> None:
         self.names = list(names)
-        self._files = dict(zip(names, find_images(names, folders), strict=True))
+        once = list(dict.fromkeys(names))
+        self._files = dict(zip(once, find_images(once, folders), strict=True))
         below = project if project.is_dir() else project.parent
         places = [os.path.relpath(folder, below) for folder in folders]
         self._used = set[str]()

@@ -123,6 +123,14 @@ def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
     return entry
 
 
+def _with_beside(entry: CalibrationFormat, texts: dict[Path, str]) -> tuple[str, ...]:
+    """The texts, and those of the files that the first one names in its own folder."""
+    if entry.beside is None:
+        return tuple(texts.values())
+    (file, text), *_ = texts.items()
+    return (*texts.values(), *(_text(file.parent / Path(name).name) for name in entry.beside(text)))
+
+
 def _in_metres(rig: Rig, baseline_m: float | None, by_image: bool) -> Rig:
     """The rig with its cameras ``baseline_m`` apart; a warning where nothing says what its unit is."""
     if baseline_m is None:
@@ -179,11 +187,7 @@ def read_calibration(
     choice = CameraChoice(cameras, image_folder_hint, image_names, image_size)
     complete = all(text.rstrip()[-1:] in ("}", "]", ">") for text in texts.values())
     with reading_whole(source, entry.summary, complete):
-        if entry.beside is not None:
-            (file, text), *_ = texts.items()
-            more = [file.parent / Path(name).name for name in entry.beside(text)]
-            texts |= {each: _text(each) for each in more}
-        rig = replace(entry.read(tuple(texts.values()), choice), source=source)
+        rig = replace(entry.read(_with_beside(entry, texts), choice), source=source)
     for side, lens in zip(("left", "right"), rig.distortion, strict=True):
         if lens is not None and not distorted:
             cure = "Undistort or rectify both images and give P1 and P2 of the result, or use geodiff depth."

@@ -361,8 +361,8 @@ class CaptureOptions(PriorOptions):
 
     path: Path = declare(
         MISSING,
-        "A COLMAP model; a transforms.json (nerfstudio, Polycam, Record3D, instant-ngp) or its folder; a "
-        "folder of 7-Scenes, ScanNet or TUM RGB-D; a video with --trajectory; or a folder of images.",
+        "A COLMAP project, a transforms.json, the raw data of Polycam, Record3D or Stray Scanner, cameras of "
+        "Metashape or OpenSfM, a sequence of EuRoC, KITTI, TUM RGB-D or ScanNet, a video, or images.",
         "",
         metavar="PATH",
     )

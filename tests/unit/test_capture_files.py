@@ -441,6 +441,16 @@ def test_a_camera_that_cannot_be_used_leaves_out_its_images(tmp_path):
     assert "f01: the model of camera 2 must be one of SIMPLE_PINHOLE" in capture.notes[0]
 
 
+def test_an_image_without_a_pose_leaves_out_itself(tmp_path):
+    images = colmap_text(tmp_path) / "sparse" / "0" / "images.txt"
+    lines = images.read_text().splitlines()
+    row = next(number for number, line in enumerate(lines) if "f02.png" in line)
+    lines[row] = "3 0 0 0 0 1 2 3 3 f02.png"
+    images.write_text("\n".join(lines))
+    capture = Capture.open(tmp_path)
+    assert capture.names == ["f00", "f01", "f03"] and "f02" in capture.notes[0]
+
+
 #: Coefficients that bend a picture by several pixels, of every model with a focal length.
 BENDS = {
     "FOV": [0.6],
