@@ -64,7 +64,7 @@ def with_marks(case: str) -> object:
     return pytest.param(case, marks=marks)
 
 
-@pytest.mark.parametrize("case", map(with_marks, CASES))
+@pytest.mark.parametrize("case", [with_marks(case) for case in CASES])
 def test_an_input_of_the_world_is_right_or_kindly_refused(case, geodiff, tmp_path, monkeypatch):
     if case.startswith("b_"):
         pytest.importorskip("rosbags")
