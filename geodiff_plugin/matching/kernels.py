@@ -101,11 +101,6 @@ def paths_kernel(
         tl.atomic_add(total_at + n * total_step, path, mask=used, sem="relaxed")
 
 
-def path_warps(padded: int) -> int:
-    """Warps of a path: one, whose threads exchange costs at once, unless its registers cannot hold them."""
-    return 1 if padded <= 512 else padded // 256
-
-
 def aggregate(levels: Tensor, penalties: Tensor, step: int, axes: Sequence[tuple[int, int]]) -> Tensor:
     """``aggregation.aggregate`` along any axes, each both ways, as ``(D, H, W)`` int32.
 
@@ -128,7 +123,7 @@ def aggregate(levels: Tensor, penalties: Tensor, step: int, axes: Sequence[tuple
         DOWN=tuple(down for down, _ in axes),
         ACROSS=tuple(across for _, across in axes),
         PADDED=triton.next_power_of_2(planes),
-        num_warps=path_warps(triton.next_power_of_2(planes)),
+        num_warps=1,
     )
     return total.permute(2, 0, 1)
 

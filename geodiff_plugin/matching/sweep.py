@@ -124,18 +124,13 @@ def sweep_planes(
     """
     size, planes = image_size(left_01), inverse_depth.cpu()
     aligned = tuple(align_view(right, K_left, size, planes) for right in rights)
-    costs = compare_views(left_01, aligned)
-    return CostVolume(*costs, planes, K_left.cpu(), left_01, tuple(rights), aligned)
-
-
-def compare_views(left_01: Tensor, views: Sequence[AlignedView]) -> tuple[Tensor, Tensor]:
-    """``CostVolume.levels`` and ``CostVolume.in_view`` of a left view ``(1, H, W)``, grey in [0, 1]."""
     left = grey_levels(F.pad(left_01[None], (MARGIN_PX,) * 4, mode="replicate")[0, 0])
-    return _all_planes(left, views) if use_kernel(left) else _plane_by_plane(left, views)
+    compare = _all_planes if use_kernel(left) else _plane_by_plane
+    return CostVolume(*compare(left, aligned), planes, K_left.cpu(), left_01, tuple(rights), aligned)
 
 
 def _plane_by_plane(left: Tensor, views: Sequence[AlignedView]) -> tuple[Tensor, Tensor]:
-    """``compare_views``, from ``grey_levels`` of the left view with a margin, a plane at a time."""
+    """``CostVolume.levels`` and ``CostVolume.in_view`` of ``grey_levels`` of the left view with a margin."""
     described = census(left)
     compared = [ComparedView(described, view) for view in views]
     count, size = len(views[0].scale), image_size(described)

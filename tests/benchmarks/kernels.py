@@ -59,11 +59,9 @@ def launches() -> Iterator[Compiled]:
 
 def _of_the_matching() -> Iterator[Compiled]:
     paths = "*u8 *i16 *i32 i32 i32 i32 i32 i32 i32 i32"
-    for planes in (128, 256, 512, 1024):
+    for planes in (128, 256, 512):
         axes = {"DOWN": (1, 0, 1, 1), "ACROSS": (0, 1, 1, -1), "PADDED": planes}
-        yield Compiled(
-            f"paths, {planes} planes", matching.paths_kernel, paths, axes, matching.path_warps(planes)
-        )
+        yield Compiled(f"paths, {planes} planes", matching.paths_kernel, paths, axes, 1)
     winner = "*i32 *u8 *i1 *fp32 *fp32 *fp32 *fp32" + 9 * " i32"
     for evidence in (True, False):
         sizes = {"EVIDENCE": evidence, "BLOCK": 8, "PADDED": 128}

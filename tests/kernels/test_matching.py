@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin.matching import aggregate, match_volume, rows, sweep_planes
+from geodiff_plugin.matching import aggregate, match_volume, sweep_planes
 from geodiff_plugin.matching.aggregation import jump_penalties
 from geodiff_plugin.matching.census import COST_LEVELS, grey
 from geodiff_plugin.matching.winner import NEVER, winner, winner_positions
@@ -152,19 +152,6 @@ def test_matches_equal_their_reference(device, names):
     torch.testing.assert_close(found.inverse_depth, expected.inverse_depth, rtol=1e-5, atol=1e-7)
     torch.testing.assert_close(found.confidence, expected.confidence, rtol=1e-5, atol=1e-6)
     assert expected.confidence.max() > 0
-
-
-def test_rows_equal_their_reference(device, monkeypatch):
-    left, views, K = views_of(("rectified",), (12, 18), device)
-    monkeypatch.setattr(rows, "HALO", 4)
-    monkeypatch.setattr(rows, "STRIP_COSTS", 0)
-    found = rows.match_rows(left, views[0], K, 4.0)
-    monkeypatch.setattr(rows, "use_kernel", lambda _: True)
-    with without_kernels():
-        expected = rows.match_rows(left, views[0], K, 4.0)
-    assert found[1].any()
-    for ours, reference in zip(found, expected, strict=True):
-        torch.testing.assert_close(ours, reference, rtol=1e-5, atol=1e-6)
 
 
 def test_few_planes_have_no_runner_up(device):

@@ -13,8 +13,8 @@ from geodiff_plugin.algorithm.gradients import RULES, Adam, FiniteWatch, power_a
 from geodiff_plugin.algorithm.schedule import count_steps, make_schedule
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
 from geodiff_plugin.config import DEFAULT
-from geodiff_plugin.matching import Matches, rows
-from geodiff_plugin.matching.rows import fill_background, match_rows
+from geodiff_plugin.matching import Matches
+from geodiff_plugin.matching.rows import match_rows
 from geodiff_plugin.result import voting
 from geodiff_plugin.result.confidence import MATCH_NOISE_PX, expected_error
 from geodiff_plugin.result.voting import vote_depth
@@ -294,36 +294,14 @@ def voted(map_m: Tensor, left: Tensor, views, matched_m: Tensor, confidence: flo
     return vote_depth(map_m, native, target, torch.full((1, 1, 1, 1), error), *spacing)
 
 
-@pytest.mark.parametrize("by_paths", [False, True])
 @pytest.mark.parametrize(("side", "doffs"), [(1, 0.0), (-1, 0.0), (1, 4.0), (-1, 4.0)])
-def test_rows_are_matched_whatever_side_and_principal_point_the_view_has(monkeypatch, side, doffs, by_paths):
-    monkeypatch.setattr(rows, "use_kernel", lambda _: by_paths)
+def test_rows_are_matched_whatever_side_and_principal_point_the_view_has(side, doffs):
     truth, left, view = scene(side, doffs)
     found, matched, filled = match_rows(left[0], view, CAMERA, 9.0)
     seen, gaps = matched > 0, filled > 0
     right = (found - 18.0 / truth[0, 0]).abs()[seen] < 0.5
     assert seen.float().mean() > 0.6 and right.float().mean() > 0.9
     assert gaps.any() and not (gaps & seen).any()
-
-
-def test_rows_are_matched_in_strips_that_overlap(monkeypatch):
-    _, left, view = scene()
-    monkeypatch.setattr(rows, "use_kernel", lambda _: True)
-    monkeypatch.setattr(rows, "HALO", 20)
-    whole = match_rows(left[0], view, CAMERA, 9.0)
-    monkeypatch.setattr(rows, "STRIP_COSTS", 0)
-    strips = match_rows(left[0], view, CAMERA, 9.0)
-    assert (strips[1] == whole[1]).float().mean() > 0.97
-    both = (strips[1] > 0) & (whole[1] > 0)
-    assert ((strips[0] - whole[0]).abs()[both] < 0.5).float().mean() > 0.99
-
-
-def test_holes_take_the_farther_neighbour_of_their_row():
-    nan = torch.nan
-    shift = torch.tensor([[nan, nan, nan], [nan, 4.0, nan], [2.0, nan, 5.0], [nan, nan, nan]])
-    expected = torch.tensor([[4.0, 4.0, 4.0], [4.0, 4.0, 4.0], [2.0, 2.0, 5.0], [2.0, 2.0, 5.0]])
-    assert torch.equal(fill_background(shift), expected)
-    assert fill_background(torch.full((2, 3), nan)).isnan().all()
 
 
 def test_a_weak_map_takes_its_edges_from_the_views_and_their_colours(monkeypatch):

@@ -84,7 +84,7 @@ def _run_sgbm(wls: bool, sample: StereoSample, settings: Settings, priors: Prior
     if wls and not hasattr(cv2, "ximgproc"):
         raise NotApplicable("cv2.ximgproc, of opencv-contrib-python, is not installed")
     with_holes = sgbm_shift(sample, wls)
-    depth_m = sample.K_left[0, 0] * sample.E[0, 3] / fill_background(torch.from_numpy(with_holes)).numpy()
+    depth_m = sample.K_left[0, 0] * sample.E[0, 3] / fill_background(with_holes)
     return Prediction(depth_m, space="disparity", notes={"density": float(np.isfinite(with_holes).mean())})
 
 
@@ -93,8 +93,8 @@ def _run_sweep(sample: StereoSample, settings: Settings, priors: PriorCache) -> 
     matches, farthest = match_volume(volume), 0.5 * float(volume.plane_step)
     # A match at infinity is none: the sky would spread over every hole beside it.
     matched = (matches.confidence[0] > 0) & (matches.inverse_depth[0] > farthest)
-    with_holes = torch.where(matched, matches.inverse_depth[0], torch.nan)
-    filled = fill_background(with_holes).cpu()[None, None]
+    with_holes = torch.where(matched, matches.inverse_depth[0], torch.nan).cpu().numpy()
+    filled = torch.from_numpy(fill_background(with_holes))[None, None]
     full = F.interpolate(filled, sample.left.shape[:2], mode="bilinear", align_corners=False)[0, 0]
     depth_m = 1.0 / np.maximum(full.numpy().astype(np.float64), farthest)
     return Prediction(depth_m, space="disparity", notes={"density": float(matched.float().mean())})
