@@ -23,8 +23,10 @@ TILE, WARPS = 512, 8
 #: The same for grids of one tile, which a program solves by itself.
 SINGLE_TILE, SINGLE_WARPS = 1024, 8
 #: Registers of a thread at most, and programs that a multiprocessor of 65,536 registers then holds.
-MOST_REGISTERS = 64
+MOST_REGISTERS = 80
 RESIDENT = 65_536 // (MOST_REGISTERS * 32 * WARPS)
+#: Registers of a thread at most, of the one program that solves a grid by itself.
+SINGLE_REGISTERS = 168
 #: Where the first iterate comes from: zeros, a field of the same grid, a field of the next coarser grid.
 FROM_ZEROS, FROM_FIELD, FROM_COARSER = 0, 1, 2
 #: Arrays of a field's size, and sums a tile, that the kernel works with.
@@ -298,8 +300,9 @@ def _conjugate_gradients(system: FieldSystem, start: Tensor | None, steps: int, 
     x, work = torch.empty_like(system.pull), start.new_empty(WORK_ARRAYS * fields * n)
     partial = start.new_ones(SUMS * count)  # in the first step the sum of the step before must be finite
     options = {"num_warps": warps}
-    if start.is_cuda and not alone:  # the interpreter knows neither
-        options |= {"maxnreg": MOST_REGISTERS, "launch_cooperative_grid": True}
+    if start.is_cuda:  # the interpreter knows neither
+        options |= {"maxnreg": SINGLE_REGISTERS if alone else MOST_REGISTERS}
+        options |= {} if alone else {"launch_cooperative_grid": True}
     conjugate_gradients_kernel[(programs,)](
         *vars(system).values(), start, x, work, partial, arrivals,
         height, width, *start.shape[-2:], channels, fields, steps, origin,

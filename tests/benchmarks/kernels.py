@@ -99,7 +99,8 @@ def _of_the_solver() -> Iterator[Compiled]:
     many = solve, sizes, algorithm.WARPS, options, algorithm.RESIDENT
     yield Compiled("conjugate gradients", kernel, *many)
     sizes = {"TILE": algorithm.SINGLE_TILE, "ALONE": True}
-    yield Compiled("conjugate gradients, one tile", kernel, solve, sizes, algorithm.SINGLE_WARPS)
+    alone = {"maxnreg": algorithm.SINGLE_REGISTERS}
+    yield Compiled("conjugate gradients, one tile", kernel, solve, sizes, algorithm.SINGLE_WARPS, alone)
 
 
 def resources(launch: Compiled, architecture: int) -> tuple[int, int]:
