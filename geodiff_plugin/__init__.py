@@ -13,8 +13,9 @@ in a call of the pipeline. Below them lie ``types``, ``geometry``, ``config``, `
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from geodiff_plugin._lazy import importer, modules_of
 
 if TYPE_CHECKING:  # what type checkers and editors see; at run time names are imported on first use
     from geodiff_plugin._checks import InputError as InputError
@@ -45,18 +46,9 @@ _NAMES_OF = {
     "runtime.pipeline": "GuidedMarigoldDepthPipeline disable_geometry_guidance enable_geometry_guidance",
     "types": "MetricDepthOutput Rig",
 }
-_MODULE_OF = {
-    name: f"geodiff_plugin.{module}" for module, names in _NAMES_OF.items() for name in names.split()
-}
+_MODULE_OF = modules_of(__name__, _NAMES_OF)
 __all__ = sorted(_MODULE_OF)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(_MODULE_OF[name]), name)
-    globals()[name] = value
-    return value
+__getattr__ = importer(__name__, _MODULE_OF)
 
 
 def __dir__() -> list[str]:

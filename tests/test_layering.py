@@ -12,6 +12,7 @@ LAYER = {
     "_camera_checks": 0,
     "_checks": 0,
     "_kernels": 0,
+    "_lazy": 0,
     "_strips": 0,
     "_threads": 0,
     "messages": 0,

@@ -9,8 +9,9 @@ wrong with them are there without torch.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from geodiff_plugin._lazy import importer, modules_of
 
 if TYPE_CHECKING:
     from geodiff_plugin.jobs.capture import depth_capture as depth_capture
@@ -41,18 +42,9 @@ _NAMES_OF = {
     "reading": "PairInputs read_pair",
     "records": "JobLog PairResult PairRun",
 }
-_MODULE_OF = {
-    name: f"geodiff_plugin.jobs.{module}" for module, names in _NAMES_OF.items() for name in names.split()
-}
+_MODULE_OF = modules_of(__name__, _NAMES_OF)
 __all__ = sorted(_MODULE_OF)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(_MODULE_OF[name]), name)
-    globals()[name] = value
-    return value
+__getattr__ = importer(__name__, _MODULE_OF)
 
 
 def __dir__() -> list[str]:

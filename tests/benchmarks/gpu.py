@@ -1,4 +1,4 @@
-"""What a second view costs on a GPU, in one run of at most four minutes: ``python -m tests.benchmarks.gpu``.
+"""What a second view costs on a GPU, in one run of some four minutes: ``python -m tests.benchmarks.gpu``.
 
 Data flow: the demo pair, Marigold v1-1's size with random weights, the bundled prior -> a table a part,
     and all of them as JSON (``--json FILE``).
