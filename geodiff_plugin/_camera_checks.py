@@ -9,8 +9,8 @@ import numpy as np
 from geodiff_plugin._checks import bad_type, bad_value, refuse, warn
 from geodiff_plugin.messages import Message
 
-#: A longer baseline, a scene or known depths all of which are further may be in millimetres.
-LONG_BASELINE_M, FAR_SCENE_M, FAR_POINTS_M = 20.0, 200.0, 100.0
+#: A longer baseline, or known depths all of which are further, may be in millimetres.
+LONG_BASELINE_M, FAR_POINTS_M = 20.0, 100.0
 #: A principal point in the outer fifth of an image is rather that of an image of another size; so is one this
 #: far off the middle, in shares of the image, by nearly the same share both ways: few crops move both alike.
 NEAR_BORDER, OFF_MIDDLE, NEARLY_ALIKE = 0.2, 0.12, 0.08

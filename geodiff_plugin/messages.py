@@ -197,7 +197,8 @@ MESSAGES: dict[str, MessageKind] = {
     "baseline.long": MessageKind(
         "The baseline is longer than 20 m",
         cause="The translation is in millimetres.",
-        cure="Divide E[:3, 3], or the baseline, by 1000.",
+        cure="Divide E[:3, 3], or the baseline, by 1000. If it is in metres, give the range of the scene "
+        "(depth_range, --near, --far).",
         forbids_trust=True,
     ),
     "baseline.short": MessageKind(
@@ -238,8 +239,10 @@ MESSAGES: dict[str, MessageKind] = {
     ),
     "pose.unit": MessageKind(
         "Baseline and scene are implausibly large",
-        cause="The translation is in centimetres or millimetres.",
-        cure="Divide it by 100 or 1000. If the scene is as far away as that, ignore the message.",
+        cause="The baseline or the translation is in centimetres or millimetres.",
+        cure="Divide it by 100 or 1000. If the scene is as far away as that, give its range in metres "
+        "(depth_range, --near, --far).",
+        forbids_trust=True,
     ),
     "pose.refined": MessageKind(
         "The given pose was off by more than a pixel and was refined",
@@ -418,6 +421,13 @@ MESSAGES: dict[str, MessageKind] = {
         cause="The baseline is not in metres, K is of another image size, or the prior does not know such "
         "scenes.",
         cure="Check the baseline and K. If the prior was trained on other scenes, ignore the message.",
+    ),
+    "prior.unit": MessageKind(
+        "The depth is more than 20 times the prior's own metres, or less than a twentieth",
+        cause="The baseline is not in metres.",
+        cure="Check the unit of the baseline. If it is right, give the range of the scene in metres "
+        "(depth_range, --near, --far), or use another prior.",
+        forbids_trust=True,
     ),
     "prior.one-member": MessageKind(
         "Only one member of the ensemble runs",

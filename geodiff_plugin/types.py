@@ -139,8 +139,11 @@ class Indicators:
     points_off: float = math.nan  # share of the points that differ from the matches by 1.2 or more
     points: int = 0  # number of known depths within the image
     cover: float = 0.0  # share of 8x8 equal parts of the image in which they lie
+    range_given: bool = False  # the user gave the range of depths
     at_end: float = 0.0  # share of the confident matches on the first or the last plane of a given range
     baseline_m: float = 0.0  # distance of the first right camera; 0 without one, or where it has no unit
+    scene_m: float = math.nan  # median of the matched depths, if lengths are in metres
+    rectified: bool = False  # the cameras of the first pair are parallel, and one stands beside the other
     view_deg: float = math.nan  # horizontal field of view that K gives the left image
     prior_ratio: float = math.nan  # median of the depth over a metric prior's depth
     epipolar_px: float = math.nan  # median distance of matches from their epipolar lines, the worst view's

@@ -47,7 +47,7 @@ def make_evidence(
         return prepare_evidence(posed, points, config, needs_matches, untouched(views)[1])
 
     def checked() -> tuple[tuple[CameraView, ...], PoseReport]:
-        return refine_views(left_01, views, native.K_left, given.unit, measured)
+        return refine_views(left_01, views, native.K_left, measured)
 
     check, as_given = Beside(checked, left_01.device), None
     try:

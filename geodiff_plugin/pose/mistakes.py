@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from geodiff_plugin._camera_checks import FAR_SCENE_M, LONG_BASELINE_M
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
@@ -61,8 +60,6 @@ _FAR_DEG = 5.0
 _FAR_SHIFT = 0.8
 # Among candidates whose share is this near the largest, a finer measure decides.
 _ALIKE = 0.95
-#: A longer baseline, with a scene as far away, may be in centimetres or millimetres.
-SUSPECT_BASELINE_M = 5.0
 
 
 class _Fit(NamedTuple):
@@ -167,24 +164,3 @@ def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> Message | N
     exactly = fit.median_px <= _AS_EXACT * nearby.median_px
     clear = (exactly or far) if coarsely else (finely and exactly and far)
     return mistake if clear else None
-
-
-def implausible_unit(tracks: Tracks, T: np.ndarray) -> Message | None:
-    """A message where baseline and scene are both a hundred or a thousand times too large, or ``None``.
-
-    Only the resulting depths show the unit of a translation. ``check_baseline`` has warned of baselines above
-    ``LONG_BASELINE_M``. Nearer scenes pass: a drone 100 m up has such baselines.
-    """
-    baseline = float(np.linalg.norm(T[:3, 3]))
-    inverse_depth = solve_inverse_depth(tracks, T[None])
-    ahead = inverse_depth > 0
-    if not SUSPECT_BASELINE_M <= baseline <= LONG_BASELINE_M or ahead.sum() < 20:
-        return None
-    depth_m = float(np.median(1.0 / inverse_depth[ahead]))
-    if depth_m < FAR_SCENE_M or depth_m / baseline > 200.0:
-        return None
-    return Message(
-        "pose.unit",
-        f"With a baseline of {baseline:.4g} m the matches lie {depth_m:.0f} m away in the median. "
-        "If the translation is in centimetres, divide it by 100; if it is in millimetres, by 1000.",
-    )

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from geodiff_plugin.messages import Message, distinct
-from geodiff_plugin.pose.mistakes import find_mistake, implausible_unit, pose_change
+from geodiff_plugin.pose.mistakes import find_mistake, pose_change
 from geodiff_plugin.pose.solve import is_rig, nearby_poses, settle_poses
 from geodiff_plugin.pose.tracks import (
     FEWEST,
@@ -91,22 +91,19 @@ class _Misfit:
     fits_px: float  # residual below which a pose fits
     rig: bool  # a rectified one
     measured: bool  # whether the lengths of the baselines are
-    units: tuple[Message, ...]  # on implausible ones
 
 
 def refine_views(
     left_01: Tensor,
     rights: Sequence[CameraView],
     K_left: Tensor,
-    unit: str | None = "m",
     measured: bool = False,
 ) -> _Refined:
     """Check the poses against the images ``(3, H, W)`` in [0, 1], and refine them where they do not fit.
 
-    Lengths in metres (``unit``) are questioned if they look like millimetres. ``measured`` baselines keep
-    their lengths, as those of a rectified rig do; others are weighed against the depth of the scene. The
-    given views are returned if they fit, if there are too few matches, if a mistake explains the misfit,
-    or if no better pose is near.
+    ``measured`` baselines keep their lengths, as those of a rectified rig do; others are weighed against the
+    depth of the scene. The given views are returned if they fit, if there are too few matches, if a mistake
+    explains the misfit, or if no better pose is near.
     """
     views, given = grey_views(left_01, rights, K_left), _poses(rights)
     sparse = sparse_tracks(views)
@@ -120,15 +117,14 @@ def refine_views(
     fits_px = FITS_PX if rig else POSED_FITS_PX
     fits = not (before > fits_px).any()
     near = given if fits else nearby_poses(sparse, given, before)
-    units = _messages(sparse, implausible_unit, given) if unit == "m" else ()
     if mistakes := _messages(sparse, find_mistake, given, near):
         return tuple(rights), replace(report, status="mistaken", warnings=mistakes)
     if fits:
-        return tuple(rights), replace(report, warnings=units)
+        return tuple(rights), report
     depth_m = coarse_depth(left_01, _applied(rights, near), K_left, views[0][0].shape)
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
     sizes = [(image.shape[0], image.shape[1]) for image, _ in views[1:]]
-    return _refined(_Misfit(rights, sizes, tracks, given, near, fits_px, rig, measured, units), report)
+    return _refined(_Misfit(rights, sizes, tracks, given, near, fits_px, rig, measured), report)
 
 
 def _refined(misfit: _Misfit, report: PoseReport) -> _Refined:
@@ -144,13 +140,13 @@ def _refined(misfit: _Misfit, report: PoseReport) -> _Refined:
     report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
     doubts = undecided(tracks, Ts, free)
     if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
-        warnings = _kept_misfit(before, worst) + doubts + misfit.units
+        warnings = _kept_misfit(before, worst) + doubts
         return tuple(rights), replace(report, status="kept", warnings=warnings)
     turned_deg, shifts = pose_change(given, Ts)
     far = ~((turned_deg < _MOST_TURN_DEG) & (shifts < _MOST_SHIFT))
     if far.any():
         v = int(np.lexsort((np.nan_to_num(before), far & ~np.isnan(before)))[-1])  # the worst of the far ones
-        warnings = _too_far(before, after, v, turned_deg[v], shifts[v]) + misfit.units
+        warnings = _too_far(before, after, v, turned_deg[v], shifts[v])
         return tuple(rights), replace(report, status="kept", warnings=warnings)
     keeps_length = misfit.rig or misfit.measured
     Ts, spread = (Ts, None) if keeps_length else _rescaled(tracks, given, Ts, before)
@@ -163,7 +159,7 @@ def _refined(misfit: _Misfit, report: PoseReport) -> _Refined:
     report = replace(
         report,
         status="refined",
-        warnings=_refined_misfit(before, after, worst) + doubts + misfit.units,
+        warnings=_refined_misfit(before, after, worst) + doubts,
         scale_spread=spread,
         E=_as_E(Ts),
         residual_px=tuple(median_residuals(replace(tracks, right_px=straight), Ts).tolist()),

@@ -272,7 +272,13 @@ def _indicators(evidence: Evidence, numbers: Mapping[str, float], options: Resul
     further: dict[str, Any] = {name: numbers[name] for name in names if name in numbers}
     on_edge = numbers.get("on_edge", 0.0) > 0
     return indicators_of(
-        evidence, numbers, options.has_unit, on_edge=on_edge, doubts=options.doubts, **further
+        evidence,
+        numbers,
+        options.has_unit,
+        on_edge=on_edge,
+        doubts=options.doubts,
+        range_given=options.config.depth_range is not None,
+        **further,
     )
 
 

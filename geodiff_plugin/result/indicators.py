@@ -12,10 +12,10 @@ from torch import Tensor
 
 from geodiff_plugin._strips import row_strips
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.geometry import image_size
+from geodiff_plugin.geometry import image_size, is_rectified
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.types import Indicators
+from geodiff_plugin.types import Indicators, PosedViews
 
 #: Matches above this confidence count.
 CONFIDENT = 0.5
@@ -105,6 +105,7 @@ def _measure_matches(matches: Matches, depth_m: Tensor, planes: Tensor | None) -
     low, high = (torch.nanquantile(sample, share) for share in (0.05, 0.95))
     numbers = {"matched": confident.float().mean(), "in_front": in_front.sum()}
     numbers |= {"spread": (high / low.clamp_min(1e-9)).log(), "planes_apart": (high - low) / step}
+    numbers |= {"scene_m": 1.0 / sample.nanmedian()}
     if planes is not None:
         first, last = ((inverse_depth - planes[end]).abs() < 0.75 * step for end in (0, -1))
         numbers["at_end"] = (first | last).sum() / in_front.sum().clamp_min(1)
@@ -127,13 +128,14 @@ def indicators_of(
     known |= {"points": round(numbers["points"])} if "points" in numbers else {}
     known |= _of_matches(numbers)
     known |= further
+    if native.views:
+        known |= _of_baseline(native, numbers, has_unit)
     if pose is not None:
         for name, residuals in (("epipolar_px", pose.residual_px), ("given_px", pose.residual_px_given)):
             known[name] = max((px for px in residuals if not math.isnan(px)), default=math.nan)
         if pose.status == "mistaken":
             known["mistakes"] = tuple(m for m in pose.warnings if m.code != INVERSE.code)
     if native.views and has_unit:
-        known["baseline_m"] = float(native.views[0].T_right_from_left[:3, 3].norm())
         known["scale_spread"] = (pose and pose.scale_spread) or math.nan
     half_width = 0.5 * native.size[1]
     return Indicators(
@@ -142,6 +144,17 @@ def indicators_of(
         same=_is_same(numbers),
         inverse_fits=any(message.code == INVERSE.code for message in evidence.warnings),
     )
+
+
+def _of_baseline(native: PosedViews, numbers: Mapping[str, float], has_unit: bool) -> dict[str, Any]:
+    """What the cameras of the first pair say, and the scene under their baseline."""
+    view = native.views[0]
+    known: dict[str, Any] = {"rectified": bool(is_rectified(native.K_left, view.K, view.T_right_from_left))}
+    if has_unit:
+        known["baseline_m"] = float(view.T_right_from_left[:3, 3].norm())
+        if numbers.get("in_front", 0) >= FEWEST_MATCHES:
+            known["scene_m"] = numbers["scene_m"]
+    return known
 
 
 def _of_matches(numbers: Mapping[str, float]) -> dict[str, Any]:

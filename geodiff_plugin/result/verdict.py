@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from geodiff_plugin._camera_checks import LONG_BASELINE_M
 from geodiff_plugin.messages import Message
 from geodiff_plugin.result.indicators import POINTS_WRONG
 from geodiff_plugin.types import Indicators, Verdict
@@ -44,12 +45,24 @@ POINTS_REPORTED = math.log(1.08)
 MANY_OFF = 0.25
 #: The share above which the result is not trusted: most of the points then contradict the views.
 MOST_OFF = 0.5
-#: Shortest plausible baseline, metres; ``check_baseline`` warns of long ones.
+#: Shortest plausible baseline, metres; ``check_baseline`` warns of those above ``LONG_BASELINE_M``.
 LEAST_BASELINE_M = 1e-3
+#: From this baseline on, metres, the depth of the scene is looked at: it may be in centimetres.
+SUSPECT_BASELINE_M = 5.0
+#: A scene at least as far under such a baseline, metres in the median, is rather one of metres whose baseline
+#: is a hundred or a thousand times too long. Nearer scenes pass: a drone 100 m up has such baselines.
+FAR_SCENE_M = 200.0
+#: The same for rectified rigs, whose cameras are mounted: one a hundred times as small before a scene of half
+#: a metre or more is likelier.
+FAR_SCENE_OF_RIG_M = 50.0
+#: A scene this many baselines away is a distant landscape, whatever the unit.
+MOST_BASELINES_AWAY = 200.0
 #: Plausible horizontal fields of view, degrees: 135 mm and 10 mm in 35 mm equivalent.
 VIEWS_DEG = (15.0, 120.0)
 #: A larger ratio of the result to a metric prior's depth is reported (log).
 OWN_METRES = math.log(1.9)
+#: A ratio that no metric prior is off by, but units are: inches are by 39, centimetres by 100 (log).
+OTHER_UNIT = math.log(20.0)
 #: Distance of matches from their epipolar lines, under the best pose near the given one, that is reported;
 #: pixels of the grid of the matches.
 EPIPOLAR_PX = 2.0
@@ -69,6 +82,8 @@ MOST_AT_END = 0.05
 #: It is too narrow if this share does, four times as many.
 TOO_MANY_AT_END = 0.2
 
+#: Doubts that a stated range of depths removes.
+LENGTH_DOUBTS = ("baseline.long",)
 #: Factor of the points over the views -> the likely cause.
 FACTORS = {
     0.256: "KITTI's PNG, whose unit is 1/256 m, read as millimetres: give the points' scale as 256",
@@ -81,6 +96,7 @@ FACTORS = {
     0.3048: "metres taken for feet",
 }
 NEARLY = math.log(1.04)
+STATE_RANGE = "If the scene is as far away as that, give its range in metres (depth_range, --near, --far)."
 
 
 def points_agreement(found: Indicators) -> float:
@@ -157,6 +173,18 @@ def _views_disagree(found: Indicators) -> bool:
     return found.matched < LEAST_MATCHED or found.confidence < LEAST_CONFIDENCE or weak > 1
 
 
+def _unit_stated(found: Indicators) -> bool:
+    """Whether the user said how far away the scene is, in metres, and the matches lie there."""
+    return found.range_given and found.at_end <= TOO_MANY_AT_END
+
+
+def _unit_doubted(found: Indicators) -> bool:
+    """Whether baseline and scene are both a hundred or a thousand times too large."""
+    far_m = FAR_SCENE_OF_RIG_M if found.rectified else FAR_SCENE_M
+    far = far_m <= found.scene_m <= MOST_BASELINES_AWAY * found.baseline_m
+    return far and SUSPECT_BASELINE_M <= found.baseline_m <= LONG_BASELINE_M and not _unit_stated(found)
+
+
 def _scale_uncertain(found: Indicators) -> bool:
     return found.scale_spread > MOST_SCALE_SPREAD and found.points < LEAST_POINTS
 
@@ -167,6 +195,25 @@ def _why_exchanged(_: Indicators) -> str:
         "right swapped, is the sign of the baseline wrong, is E world-to-camera, or is a prior map of "
         "another space (--space)?"
     )
+
+
+def _why_unit(found: Indicators) -> str:
+    return (
+        f"With a baseline of {found.baseline_m:.4g} m the matches lie {found.scene_m:.0f} m away in the "
+        "median. If the baseline or the translation is in centimetres, divide it by 100; if it is in "
+        f"millimetres, by 1000. {STATE_RANGE}"
+    )
+
+
+def _why_prior(found: Indicators) -> str:
+    return (
+        f"The depth is {found.prior_ratio:.2g} times the prior's own metres: is the baseline in metres, "
+        "and K for an image of this size? Or is the scene of a kind that the prior does not know?"
+    )
+
+
+def _why_other_unit(found: Indicators) -> str:
+    return f"{_why_prior(found)} {STATE_RANGE}"
 
 
 def _why_factor(found: Indicators) -> str:
@@ -228,6 +275,12 @@ EXPLAINING = (
             f"The baseline is {1000 * found.baseline_m:.3g} mm: was it divided by 1000 once too often? "
             "Baselines and poses are in metres."
         ),
+    ),
+    Rule("pose.unit", _unit_doubted, _why_unit),
+    Rule(
+        "prior.unit",
+        lambda found: _log(found.prior_ratio) > OTHER_UNIT and not _unit_stated(found),
+        _why_other_unit,
     ),
     Rule("depth.exchanged", lambda found: found.inverse_fits, _why_exchanged),
 )
@@ -307,11 +360,8 @@ REMARKS = (
     ),
     Rule(
         "prior.metres",
-        lambda found: _log(found.prior_ratio) > OWN_METRES,
-        lambda found: (
-            f"The depth is {found.prior_ratio:.2g} times the prior's own metres: is the baseline in metres, "
-            "and K for an image of this size? Or is the scene of a kind that the prior does not know?"
-        ),
+        lambda found: OWN_METRES < _log(found.prior_ratio) <= OTHER_UNIT,
+        _why_prior,
     ),
     Rule(
         "points.differ",
@@ -345,7 +395,9 @@ def _told(rules: Sequence[Rule], found: Indicators) -> tuple[Message, ...]:
 def _reasons(found: Indicators) -> tuple[Message, ...]:
     if found.same:
         return (SAME_PICTURE,)
-    return (*found.doubts, *_told(EXPLAINING, found), *found.mistakes, *_told(REASONS, found))
+    lifted = LENGTH_DOUBTS if _unit_stated(found) else ()
+    doubts = [doubt for doubt in found.doubts if doubt.code not in lifted]
+    return (*doubts, *_told(EXPLAINING, found), *found.mistakes, *_told(REASONS, found))
 
 
 def _remarks(found: Indicators, trusted: bool) -> tuple[Message, ...]:

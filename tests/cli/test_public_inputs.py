@@ -13,7 +13,7 @@ INPUTS = Path(__file__).resolve().parents[3] / "shared" / "data" / "inputs"
 TRUTH = INPUTS / "_truth"
 #: The frame's best neighbour is the one without a pose, so its depth is no longer trusted.
 UNSURE = ("10o_one_null_pose",)
-#: A doubted length is not yet a reason against trust everywhere.
+#: Centimetres that nothing names.
 DOUBTED_UNIT = "p13_opencv_cm"
 pytestmark = pytest.mark.skipif(not TRUTH.is_dir(), reason="the inputs are not there")
 CASES = sorted(path.name for path in INPUTS.glob("*") if path.name[0] != "_") if TRUTH.is_dir() else []
@@ -58,13 +58,7 @@ def depth_of_bag(path: Path) -> np.ndarray:
     return message.data.view("<u2").reshape(message.height, message.width) / 1000
 
 
-def with_marks(case: str) -> object:
-    """The case; that of a doubted unit is known to be trusted still."""
-    marks = pytest.mark.xfail(strict=True, reason="a doubted unit is trusted") if case == DOUBTED_UNIT else ()
-    return pytest.param(case, marks=marks)
-
-
-@pytest.mark.parametrize("case", [with_marks(case) for case in CASES])
+@pytest.mark.parametrize("case", CASES)
 def test_an_input_of_the_world_is_right_or_kindly_refused(case, geodiff, tmp_path, monkeypatch):
     if case.startswith("b_"):
         pytest.importorskip("rosbags")
@@ -89,7 +83,7 @@ def test_an_input_of_the_world_is_right_or_kindly_refused(case, geodiff, tmp_pat
         verdict = json.loads((out / "report.json").read_text())["verdict"]
         depth, truth = np.load(out / "depth.npy"), "pair.png"
     error = mean_error(depth, truth)
-    if case == DOUBTED_UNIT:  # centimetres that nothing names: never trusted
+    if case == DOUBTED_UNIT:
         assert verdict["status"] != "trusted" and error > 10
         return
     assert error < (BY_DEPTHS if "depth" in words[1:] else BY_VIEWS), error

@@ -111,6 +111,44 @@ def test_remarks(signs, words):
     assert verdict.trusted and any(words in remark for remark in verdict.remarks)
 
 
+@pytest.mark.parametrize(
+    ("signs", "code"),
+    [
+        # A rectified rig in centimetres before a scene of half a metre or more.
+        ({"baseline_m": 7.5, "scene_m": 51.0, "rectified": True}, "pose.unit"),
+        ({"baseline_m": 7.5, "scene_m": 49.0, "rectified": True}, None),
+        # Of other poses, a drone's are that long.
+        ({"baseline_m": 7.5, "scene_m": 199.0}, None),
+        ({"baseline_m": 7.5, "scene_m": 201.0}, "pose.unit"),
+        ({"baseline_m": 4.9, "scene_m": 400.0, "rectified": True}, None),
+        ({"baseline_m": 5.1, "scene_m": 400.0, "rectified": True}, "pose.unit"),
+        ({"baseline_m": 10.0, "scene_m": 1999.0}, "pose.unit"),
+        ({"baseline_m": 10.0, "scene_m": 2001.0}, None),
+        ({"baseline_m": 10.0}, None),
+        ({"baseline_m": 10.0, "scene_m": 400.0, "points_ratio": 1.0, "points": 50}, "pose.unit"),
+        ({"baseline_m": 10.0, "scene_m": 400.0, "range_given": True, "at_end": 0.19}, None),
+        ({"baseline_m": 10.0, "scene_m": 400.0, "range_given": True, "at_end": 0.21}, "pose.unit"),
+        ({"prior_ratio": 19.0}, None),
+        ({"prior_ratio": 21.0}, "prior.unit"),
+        ({"prior_ratio": 1 / 19.0}, None),
+        ({"prior_ratio": 1 / 21.0}, "prior.unit"),
+        ({"prior_ratio": 21.0, "range_given": True}, None),
+    ],
+)
+def test_a_doubted_unit_is_not_trusted_unless_the_range_is_stated(signs, code):
+    found = [reason.code for reason in judge(replace(GOOD, **signs)).reasons]
+    assert [each for each in found if each != "depth.range"] == ([] if code is None else [code])
+
+
+def test_a_stated_range_removes_the_doubt_about_a_long_baseline_and_no_other():
+    long = Message("baseline.long", "E has a baseline of 25 m.")
+    other = Message("camera.principal-point", "K is for another image.")
+    doubted = replace(GOOD, baseline_m=25.0, doubts=(long, other))
+    assert [reason.code for reason in judge(doubted).reasons] == [long.code, other.code]
+    stated = replace(doubted, range_given=True)
+    assert [reason.code for reason in judge(stated).reasons] == [other.code]
+
+
 def test_an_end_at_the_edge_of_the_search_is_told_beside_a_reason():
     (remark,) = judge(replace(GOOD, on_edge=True, off_matches=0.4)).remarks
     assert remark.code == "depth.search-edge"
@@ -160,6 +198,23 @@ def test_a_rendered_pair_right_and_wrong(run, scene):
         run(right=left.copy())
     with pytest.raises(InputError, match="Do not trust this depth"):
         run(right=np.ascontiguousarray(right[:, ::-1]), strict=True)
+
+
+def test_centimetres_for_metres_are_never_trusted(run, scene):
+    _, _, _, E, depth = scene
+    longer = np.ones((4, 4))
+    longer[:3, 3] = 100.0
+    wrong = run(E=E * longer)
+    (reason,) = wrong.verdicts[0].reasons
+    assert reason.code == "pose.unit" and "in centimetres, divide it by 100" in reason
+    found = wrong.verdicts[0].indicators
+    assert found.rectified and found.scene_m == pytest.approx(100 * np.median(depth), rel=0.1)
+    with pytest.raises(InputError, match="in centimetres"):
+        run(E=E * longer, strict=True)
+    assert run(E=E * longer, unit=None).verdicts[0].trusted, "lengths without a unit are not doubted"
+    stated = (50 * depth.min(), 200 * depth.max())
+    assert run(E=E * longer, depth_range=stated).verdicts[0].trusted
+    assert not run(E=E * longer, depth_range=(depth.min(), depth.max())).verdicts[0].trusted
 
 
 @pytest.mark.filterwarnings("ignore:points has depths")
