@@ -13,6 +13,8 @@ import pytest
 import geodiff_plugin
 
 ROOT = Path(__file__).resolve().parents[1]
+#: What a user waits for on a slow line.
+LARGEST_WHEEL_BYTES = 20_000_000
 HEAVY = ("torch", "diffusers", "transformers", "scipy")
 
 
@@ -60,8 +62,11 @@ def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_wheel_holds_what_users_need_and_no_more(unpacked: Path) -> None:
     package = unpacked / "geodiff_plugin"
     weights = "bundled/prior/unet/diffusion_pytorch_model.safetensors"
-    for name in ("py.typed", weights, "bundled/pair/left.png"):
+    for name in ("py.typed", weights, "bundled/pair/left.png", "bundled/real/LICENSE"):
         assert (package / name).is_file()
+    for folder in (path for path in (package / "bundled" / "real").iterdir() if path.is_dir()):
+        assert sorted(path.name for path in folder.iterdir()) == ["calib.txt", "left.png", "right.png"]
+    assert next(unpacked.parent.glob("*.whl")).stat().st_size < LARGEST_WHEEL_BYTES
     assert not (unpacked / "tests").exists()
 
 

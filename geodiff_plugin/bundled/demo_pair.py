@@ -1,4 +1,4 @@
-"""The stereo pair of ``geodiff demo``: rendered by this package, with exact depth."""
+"""The stereo pairs of ``geodiff demo``: one rendered by this package, with exact depth, and real ones."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from geodiff_plugin.types import Rig
 
 #: ``left.png``, ``right.png``, ``calib.txt`` (Middlebury's format), ``depth_mm.png``.
 DEMO_PAIR_FOLDER = Path(__file__).resolve().parent / "pair"
+#: The real pairs, a folder each with ``left.png``, ``right.png`` and ``calib.txt``; MIT licence.
+REAL_PAIRS_FOLDER = Path(__file__).resolve().parent / "real"
 
 
 @dataclass(frozen=True)

@@ -68,14 +68,31 @@ class _Demo:
     )
     overwrite: bool = _out(False, "Write into a folder that holds files.")
     quiet: bool = _out(False, "Show no progress bar.", "--quiet", "-q")
+    real: bool = declare(False, "Run on three pairs of a real stereo camera instead; no truth is known.")
 
     def run(self) -> None:
-        pair = Path(__file__).resolve().parents[1] / "bundled" / "pair"
+        bundled = Path(__file__).resolve().parents[1] / "bundled"
+        options = self._options(bundled / "pair")
+        if self.real:
+            folders = sorted(path for path in (bundled / "real").iterdir() if path.is_dir())
+            _imported("cli.demo.run_real_demo")([self._options(folder) for folder in folders], options.out)
+        else:
+            with start_pair(options) as folder:
+                _imported("cli.demo.run_demo")(options, folder)
+
+    def _options(self, pair: Path) -> DepthOptions:
+        """What ``geodiff depth`` takes to run on such a folder."""
         left, right, calib = (pair / name for name in ("left.png", "right.png", "calib.txt"))
-        options = DepthOptions(left=left, right=right, calib=(calib,), device="cpu", **vars(self))
-        options = with_folder(options, "geodiff-demo")
-        with start_pair(options) as folder:
-            _imported("cli.demo.run_demo")(options, folder)
+        options = DepthOptions(
+            left=left,
+            right=right,
+            calib=(calib,),
+            device="cpu",
+            out=self.out,
+            overwrite=self.overwrite,
+            quiet=self.quiet,
+        )
+        return with_folder(options, "geodiff-demo")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +159,7 @@ class _Convert:
 COMMANDS = {
     "depth": Command(DepthOptions, _depth, "Metric depth of LEFT, guided by RIGHT: one pair, or many."),
     "capture": Command(CaptureOptions, _capture, "Metric depth of the frames of a capture, and one cloud."),
-    "demo": Command(_Demo, _Demo.run, "Run on the bundled pair, and compare with its true depth."),
+    "demo": Command(_Demo, _Demo.run, "Run on the bundled pair, whose depth is known, or on real ones."),
     "info": Command(_Info, _later("cli.info.run_info"), "Show versions, devices and priors."),
     "bench": Command(PriorOptions, _later("cli.demo.run_bench"), "Measure how much time guidance adds."),
     "video": Command(_Video, _later("cli.results.run_video"), "Join the depth maps of frames into a video."),

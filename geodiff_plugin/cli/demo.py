@@ -1,4 +1,4 @@
-"""On the bundled pair: ``geodiff demo``, whose depth is known, and ``geodiff bench``, what guidance costs."""
+"""On the bundled pairs: ``geodiff demo``, and ``geodiff bench``, what guidance costs."""
 
 from __future__ import annotations
 
@@ -7,8 +7,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
+import numpy as np
 import torch
 
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
@@ -17,7 +21,7 @@ from geodiff_plugin.evaluation.metrics import align, evaluate_depth
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.formats.out import OutFolder
-from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.jobs.options import DepthOptions, start_pair
 from geodiff_plugin.jobs.pair import depth_pair
 from geodiff_plugin.jobs.prior import load_guided_prior, prior_of_options
 from geodiff_plugin.jobs.report import single_map, summary_line
@@ -27,6 +31,7 @@ from geodiff_plugin.runtime.machine import pick_device, timed
 from geodiff_plugin.runtime.pipeline import count_guided_steps
 
 CELL_WIDTH = 360
+COMPARISON = "comparison.png"
 #: Calls of which the fastest counts.
 CALLS = 3
 
@@ -50,13 +55,39 @@ def run_demo(options: DepthOptions, out: OutFolder) -> None:
     near, far = depth_range(pair.depth_m)
     maps = [colour_depth(depth_m, near=near, far=far) for depth_m in (aligned_m, guided_m, pair.depth_m)]
     titles = ["left image", "prior, aligned by an oracle", "guided", f"truth, {near:.1f} m to {far:.1f} m"]
-    try:
-        with atomic_path(out.path / "comparison.png") as temporary:
-            grid([pair.left, *maps], titles, cell_width=CELL_WIDTH).save(temporary, optimize=True)
-    except OSError as error:  # the result itself is safe
-        say(f"geodiff: comparison.png could not be written ({error.strerror or error}).")
+    _write_comparison(out.path, [pair.left, *maps], titles)
     print(summary_line(result.report, f"{out.path}/"))
-    print(f"Open {out.path / 'comparison.png'} first: prior, guided depth and truth side by side.")
+    print(f"Open {out.path / COMPARISON} first: prior, guided depth and truth side by side.")
+
+
+def _write_comparison(
+    folder: Path, pictures: Sequence[np.ndarray], titles: Sequence[str], columns: int | None = None
+) -> None:
+    try:
+        with atomic_path(folder / COMPARISON) as temporary:
+            sheet = grid(pictures, titles, columns=columns, cell_width=CELL_WIDTH)
+            sheet.save(temporary, optimize=True)
+    except OSError as error:  # the results themselves are safe
+        say(f"geodiff: {COMPARISON} could not be written ({error.strerror or error}).")
+
+
+def run_real_demo(pairs: Sequence[DepthOptions], out: Path) -> None:
+    """Write what ``geodiff depth`` writes of every pair into ``out/NAME``, and ``comparison.png`` of all."""
+    first, cells, titles = pairs[0], list[np.ndarray](), list[str]()
+    tell = silent if first.quiet else say
+    with collected_warnings():
+        pipe = prior_of_options(first, pick_device(first.device), None if first.quiet else say)
+        for pair in pairs:
+            name = pair.left.parent.name
+            options = replace(pair, out=out / name)
+            with start_pair(options) as folder:
+                result = depth_pair(options, pipe, folder=folder, tell=tell, progress=not options.quiet)
+            print(summary_line(result.report, f"{folder.path}/"))
+            depth_m = single_map(result.run.output.prediction)
+            cells += [result.run.inputs.left, colour_depth(depth_m)]
+            titles += [name, "{:.1f} m to {:.1f} m".format(*depth_range(depth_m))]
+    _write_comparison(out, cells, titles, columns=2)
+    print(f"Open {out / COMPARISON} first: every left image beside its depth.")
 
 
 def run_bench(prior: str, space: str | None, steps: int | None, seed: int, device: str) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from geodiff_plugin.bundled.demo_pair import REAL_PAIRS_FOLDER
 from tests.cli.conftest import QUICK, report_of
 from tests.contracts.tiny_priors import TINY
 
@@ -134,6 +135,17 @@ def test_demo(geodiff, prior, pair_files, monkeypatch):
     assert f"Open {Path('geodiff-demo', 'comparison.png')} first" in answer.out
     assert names_in("geodiff-demo") == FILES | CONFIDENCE | {"comparison.png"}
     assert np.load("geodiff-demo/depth.npy").shape == (336, 448)
+
+
+def test_demo_on_real_pairs(geodiff, prior, monkeypatch):
+    monkeypatch.setattr("geodiff_plugin.priors.loading.BUNDLED_FOLDER", prior)
+    answer = geodiff("demo", "--real", "--quiet")
+    names = sorted(path.parent.name for path in REAL_PAIRS_FOLDER.glob("*/calib.txt"))
+    assert len(names) == 3 and names_in("geodiff-demo") == {*names, "comparison.png"}
+    for name in names:
+        assert f"-> geodiff-demo/{name}/" in answer.out
+        with Image.open(REAL_PAIRS_FOLDER / name / "left.png") as left:
+            assert np.load(f"geodiff-demo/{name}/depth.npy").shape == left.size[::-1]
 
 
 # Priors
