@@ -38,10 +38,10 @@ from transformers import CLIPTextModel, CLIPTokenizer
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.priors import prior_of
-from geodiff_plugin.runtime.estimate import ProcessingGrid
+from geodiff_plugin.runtime.estimate import MapCodec, ProcessingGrid
 from geodiff_plugin.runtime.hooks import frozen_weights
 from geodiff_plugin.runtime.pipeline import count_guided_steps
-from geodiff_plugin.runtime.run import GuidedRun, RunInputs
+from geodiff_plugin.runtime.run import GuidedRun
 
 UNET = ComponentSpec("unet", UNet2DConditionModel)
 VAE = ComponentSpec("vae", AutoencoderKL)
@@ -329,7 +329,6 @@ class GeometryEvidenceStep(Block):
         """Prepare the guided run on the same networks."""
         parts = {spec.name: getattr(components, spec.name) for spec in self.components}
         host = MarigoldDepthPipeline(**parts, prediction_type=block_state.prediction_type or "depth")
-        prior = prior_of(host)
         knobs = {**(block_state.knobs or {}), "points": block_state.points}
         guidance = GeometryGuidance(block_state.right, block_state.K, block_state.E, **knobs)
         asked = block_state.num_inference_steps
@@ -339,8 +338,8 @@ class GeometryEvidenceStep(Block):
         call = {name: value.default for name, value in signature.parameters.items()}
         call |= {"image": block_state.image, "num_inference_steps": steps}
         grid = ProcessingGrid(block_state.content, block_state.padding)
-        inputs = RunInputs(guidance, lambda: evidence, call, grid, rounds)
-        block_state.geometry = GuidedRun(host, prior, inputs)
+        codec = MapCodec(host, prior_of(host), grid)
+        block_state.geometry = GuidedRun(codec, guidance, lambda: evidence, call, rounds)
         block_state.guidance, block_state.call, block_state.num_inference_steps = guidance, call, steps
 
 

@@ -1,4 +1,4 @@
-"""Find the scale of a relative map (S7.3), in this order (``_range_of_image``).
+"""Find the scale of a relative map (S7.3), in this order (``fit_depth_range``).
 
 1. ``search_scale``: near and far by lookup in the cost volume, at the first step, or at every step if too
    few matches are reliable; without a right view ``fit_to_points`` instead.
@@ -9,9 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -22,31 +20,6 @@ from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.scale.points import depth_span, fit_to_points, ordered, refine_to_matches
 from geodiff_plugin.scale.space import AffineState, DepthRange, MetricMap, smooth_floor
 from geodiff_plugin.scale.volume_search import search_scale
-
-
-@dataclass(frozen=True)
-class Samples:
-    """The samples of a chunk: of which image each is, and where the prior gives a depth."""
-
-    image_of_sample: tuple[int, ...]  # samples of one image lie side by side
-    evidence: tuple[Evidence, ...]  # of the image of each sample
-    valid: Tensor | None = None  # (B, 1, h, w) bool, where matches do not decide alone; ``None`` for all
-
-    def __len__(self) -> int:
-        return len(self.image_of_sample)
-
-    @cached_property
-    def judged(self) -> tuple[Evidence, ...]:
-        """What the prior is compared with: the evidence where the prior gives a depth."""
-        if self.valid is None:
-            return self.evidence
-        return tuple(each.within(valid) for each, valid in zip(self.evidence, self.valid, strict=True))
-
-    def of_images(self) -> Iterator[slice]:
-        """The samples of every image."""
-        for image in sorted(set(self.image_of_sample)):
-            first = self.image_of_sample.index(image)
-            yield slice(first, first + self.image_of_sample.count(image))
 
 
 def span_of_points(evidence: Sequence[Evidence]) -> DepthRange:
@@ -75,31 +48,18 @@ def search_one_number(x: Tensor, objective: Objective) -> tuple[AffineState, Ten
 
 
 def fit_depth_range(
-    x: Tensor, samples: Samples, metric: MetricMap, config: GuidanceConfig, current: DepthRange | None
-) -> DepthRange:
-    """The depth range of maps ``x (B, 1, h, w)``, one per sample, that their views and points agree on best.
-
-    The ``current`` range, whose ``on_edge`` is ``None`` before the first search, stays unless a better basin
-    shows up.
-    """
-    ranges = []
-    for members in samples.of_images():
-        before = None if current is None else current.of(members)
-        valid = None if samples.valid is None else samples.valid[members][:1]
-        evidence = samples.judged[members.start]
-        ranges.append(_range_of_image(x[members], evidence, metric, config, before, valid))
-    return DepthRange(*(torch.cat(values) for values in zip(*ranges, strict=True)))
-
-
-def _range_of_image(
     x: Tensor,
     evidence: Evidence,
     metric: MetricMap,
     config: GuidanceConfig,
-    current: DepthRange | None,
-    valid: Tensor | None,
+    current: DepthRange | None = None,
+    valid: Tensor | None = None,
 ) -> DepthRange:
-    """``fit_depth_range`` of one image."""
+    """The depth range of one image's maps ``x (B, 1, h, w)`` that its views and points agree on best.
+
+    The ``current`` range, whose ``on_edge`` is ``None`` before the first search, stays unless a better basin
+    shows up. Only pixels that are ``valid (1, 1, h, w)`` are compared.
+    """
     space, floored, reliable = metric.space, smooth_floor(x), evidence.reliable
     if evidence.volume is None:
         assert evidence.points is not None  # without views there are points

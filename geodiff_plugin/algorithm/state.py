@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
+from itertools import accumulate, groupby
 
 import torch
 import torch.nn.functional as F
@@ -12,21 +15,32 @@ from torch import Tensor
 from geodiff_plugin.algorithm.correction import correction_target, fit_depth, local_error, prior_error
 from geodiff_plugin.algorithm.gradients import RULES, SUMMED, FiniteWatch
 from geodiff_plugin.algorithm.member import Member
-from geodiff_plugin.algorithm.settling import Samples, fit_depth_range, search_one_number, span_of_points
+from geodiff_plugin.algorithm.settling import fit_depth_range, search_one_number, span_of_points
 from geodiff_plugin.algorithm.terms import Given, Loss, Objective
 from geodiff_plugin.algorithm.views import chunk_views
 from geodiff_plugin.config import GuidanceConfig
+from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.matching import Matches, reject_reflections
 from geodiff_plugin.scale.points import order_agreement
-from geodiff_plugin.scale.space import AffineState, DepthRange, MetricMap
+from geodiff_plugin.scale.space import AffineState, DepthRange, MetricMap, PriorMaps
 from geodiff_plugin.types import StepReport
+
+
+def _samples_of_images(image_of_sample: Sequence[int]) -> list[slice]:
+    """The samples of every image, which lie side by side."""
+    counts = [len(list(samples)) for _, samples in groupby(image_of_sample)]
+    return [slice(last - count, last) for count, last in zip(counts, accumulate(counts), strict=True)]
 
 
 class Trajectory:
     """State of one chunk of samples through the schedule.
 
-    The scale search starts from ``prior_range``, a metric prior's metres at ``x = 0`` and ``x = 1``, ``(B,)``
-    each. Where the samples are not ``valid`` the prior gives no depth, and matches alone decide.
+    Args:
+        config: the hyperparameters.
+        evidence: of every image of the call.
+        image_of_sample: the image of each sample of the chunk; those of one image lie side by side.
+        maps: what is known of the prior's maps.
+        step_latents: size of a gradient update of the latent.
     """
 
     affine: AffineState  # after the latest update; set by ``settle_scale``
@@ -40,22 +54,21 @@ class Trajectory:
     def __init__(
         self,
         config: GuidanceConfig,
-        samples: Samples,
-        space: str,
+        evidence: Sequence[Evidence],
+        image_of_sample: Sequence[int],
+        maps: PriorMaps,
         step_latents: float = 0.0,
-        prior_range: tuple[Tensor, Tensor] | None = None,
     ) -> None:
-        self.config, self.samples = config, samples
-        self.metric = MetricMap(space, config.positive)
-        self.objective = Objective(chunk_views(samples.evidence), self.metric, config)
-        self.matches = Matches.stack([e.matches for e in samples.evidence])
-        self.points = Matches.stack([e.points for e in samples.evidence])
+        self.config, self.maps = config, maps
+        self.evidence = [evidence[image] for image in image_of_sample]  # of each sample
+        self.metric = MetricMap(maps.space, config.positive)
+        self.objective = Objective(chunk_views(self.evidence), self.metric, config)
+        self.matches = Matches.stack([e.matches for e in self.evidence])
+        self.points = Matches.stack([e.points for e in self.evidence])
         pixels = math.prod(self.objective.views.size) if config.rule == SUMMED else 1
         self.latent_rule = RULES[config.rule](step_latents * pixels)
         self.scale_rule, self.shift_rule = (RULES[config.rule](config.step_affine) for _ in range(2))
-        self._prior_range = None
-        if prior_range is not None:  # nearest and farthest: for disparity x = 1 is the nearest
-            self._prior_range = DepthRange(*torch.stack(prior_range).sort(0).values)
+        self._images = _samples_of_images(image_of_sample)
         self._affine_start: AffineState | None = None  # the search's result, which the loss pulls towards
         self.history: list[StepReport] = []
         self.watch = FiniteWatch()
@@ -69,8 +82,8 @@ class Trajectory:
         """Find the scale of an estimate ``x``, decoded from ``z0``; at the first one judge the matches."""
         self.note("the network's clean latent", z0)
         self.note("the decoded map", x)
-        if self._prior_range is not None and self.prior_depth_m is None:
-            near_m, far_m, _ = self._prior_range
+        if self.maps.depth_range is not None and self.prior_depth_m is None:
+            near_m, far_m, _ = self.maps.depth_range
             self.prior_depth_m = self.metric(x, self.metric.from_range(near_m, far_m))
         if self.rank_correlation is None:
             self.rank_correlation = self._rank_correlation(x)
@@ -81,33 +94,50 @@ class Trajectory:
         """Search g_s and the start of scale and shift for a relative map (S7.3), or improve those in use."""
         is_first = self._affine_start is None
         if self.config.search == "volume":
-            current = self._prior_range
+            current = self.maps.depth_range
             if not is_first:
                 current = DepthRange(*self.metric.range_of(self.affine), self.on_edge)
-            near_m, far_m, self.on_edge = fit_depth_range(x, self.samples, self.metric, self.config, current)
+            near_m, far_m, self.on_edge = self._fitted_range(x, current)
             self.affine = self._affine_start = self.metric.from_range(near_m, far_m)
         elif is_first:
             if self.config.search == "one-number":
                 start, self.on_edge = search_one_number(x, self.objective)
             else:
-                near_m, far_m, self.on_edge = span_of_points(self.samples.evidence)
+                near_m, far_m, self.on_edge = span_of_points(self.evidence)
                 start = self.metric.from_range(near_m, far_m)
             self.affine = self._affine_start = start
+
+    def _fitted_range(self, x: Tensor, current: DepthRange | None) -> DepthRange:
+        """``fit_depth_range`` of every image."""
+        ranges = []
+        for samples, judged in zip(self._images, self._judged, strict=True):
+            before = None if current is None else current.of(samples)
+            valid = None if self.maps.valid is None else self.maps.valid[samples][:1]
+            ranges.append(fit_depth_range(x[samples], judged, self.metric, self.config, before, valid))
+        return DepthRange(*(torch.cat(values) for values in zip(*ranges, strict=True)))
+
+    @cached_property
+    def _judged(self) -> list[Evidence]:
+        """What the prior is compared with: the evidence of every image where the prior gives a depth."""
+        firsts, valid = [samples.start for samples in self._images], self.maps.valid
+        if valid is None:
+            return [self.evidence[first] for first in firsts]
+        return [self.evidence[first].within(valid[first]) for first in firsts]
 
     def _rank_correlation(self, x: Tensor) -> Tensor:
         """Rank correlation ``(B,)`` of the prior alone with matches or points; NaN without enough of them."""
         correlation = x.new_full((x.shape[0],), torch.nan)
-        for i, evidence in enumerate(self.samples.judged):
-            target = evidence.matches or evidence.points
+        for samples, judged in zip(self._images, self._judged, strict=True):
+            target = judged.matches or judged.points
             if target is not None:
-                correlation[i] = order_agreement(x[i : i + 1], target, self.metric.space)
+                correlation[samples] = order_agreement(x[samples], target, self.metric.space)
         return correlation
 
     def _judge_matches(self, x: Tensor) -> None:
         """At the first estimate: find matches that look like reflections, and measure the prior's error."""
         if self.error is not None or (self.matches is None and self.points is None):
             return
-        config, valid = self.config, self.samples.valid
+        config, valid = self.config, self.maps.valid
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         if self.matches is not None and self.reflection_weight is None:
             self.reflection_weight = torch.ones_like(depth_m)
@@ -124,7 +154,7 @@ class Trajectory:
             self.error = prior_error(depth_m, target, self.objective.views.left_01, config)
 
     def _target(self, depth_m: Tensor) -> Matches | None:
-        error = local_error(self.error, self.samples.valid)
+        error = local_error(self.error, self.maps.valid)
         return correction_target(self.matches, self.points, self.reflection_weight, error, depth_m)
 
     def find_hidden(self, x: Tensor) -> None:
@@ -137,7 +167,7 @@ class Trajectory:
     def corrected(self, x: Tensor) -> Tensor:
         """A relative map ``x (B, 1, h, w)`` fitted to matches and points; ``x`` where there are neither."""
         depth_m = self.objective.metric_depth(x, self.affine)
-        target, error = self._target(depth_m), local_error(self.error, self.samples.valid)
+        target, error = self._target(depth_m), local_error(self.error, self.maps.valid)
         if target is None or error is None:
             return x
         _, _, field = fit_depth(depth_m, target, self.objective.views.left_01, error, self.config)
@@ -172,7 +202,7 @@ class Trajectory:
         """What act 3 gets of every sample: of the maps ``x`` without padding, and of their ``result``."""
         near_m, far_m = depth_m.amin((1, 2, 3), keepdim=True), depth_m.amax((1, 2, 3), keepdim=True)
         members = []
-        for i in range(len(self.samples)):
+        for i in range(len(self.evidence)):
             of_sample = slice(i, i + 1)
 
             def part(values: Tensor | None, of_sample: slice = of_sample) -> Tensor | None:
@@ -187,7 +217,7 @@ class Trajectory:
                     far_m=far_m[of_sample],
                     reflection_weight=part(self.reflection_weight),
                     error=part(self.error),
-                    valid=part(self.samples.valid),
+                    valid=part(self.maps.valid),
                     rank_correlation=part(self.rank_correlation),
                     on_edge=part(self.on_edge),
                     prior_depth_m=part(self.prior_depth_m),

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.geometry import as_fine_as, image_size, resize_image, sampled_rays
+from geodiff_plugin.geometry import PlaneRays, as_fine_as, image_size, resize_image, sampled_rays
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
@@ -100,20 +100,19 @@ def pilot_volume(
     """
     left, small, K = to_grid(grey(left_01), _grey_views(rights), _on_cpu(K_left), pixels)
     size = image_size(left)
-    each = _at_shift(small, K, size, PILOT_SHIFT)
+    each = _at_shift([sampled_rays(K, K_r, T, size) for _, K_r, T in small], PILOT_SHIFT * size[1])
     limit = torch.minimum(each.amax(), MOST_NEARER * each.amin())
     span = (torch.zeros_like(limit), limit)
     planes = _even_planes(span, size, small, K, PILOT_STEP_PX, PILOT_PLANES)
     return sweep_planes(left, small, K, planes)
 
 
-def _at_shift(rights: Sequence[CameraView], K: Tensor, size: tuple[int, int], fraction: float) -> Tensor:
-    """``(V,)`` inverse depths at which each view has moved by this fraction of the width."""
+def _at_shift(rays: Sequence[PlaneRays], shift_px: float) -> Tensor:
+    """``(V,)`` inverse depths at which each view has moved by so many pixels."""
     nearest = []
-    for v, (_, K_r, T) in enumerate(rights, 1):
-        name = "E" if len(rights) == 1 else f"E of right view {v}"
-        rays = sampled_rays(K, K_r, T, size)
-        nearest.append(inverse_depth_at_shift(rays, fraction * size[1], name))
+    for v, of_view in enumerate(rays, 1):
+        name = "E" if len(rays) == 1 else f"E of right view {v}"
+        nearest.append(inverse_depth_at_shift(of_view, shift_px, name))
     return torch.stack(nearest)
 
 
@@ -126,7 +125,7 @@ def _nearest_inverse_depth(pilot: CostVolume) -> Tensor:
     read = torch.stack([torch.nanquantile(inverse_depth, PILOT_QUANTILE), reliable.float().mean()])
     nearest, share = read.cpu()
     limit = pilot.inverse_depth[-1]
-    least = _at_shift(pilot.rights, pilot.K, pilot.size, LEAST_SHIFT).amin()
+    least = _at_shift(pilot.rays, LEAST_SHIFT * pilot.size[1]).amin()
     # With few reliable matches the planes must span everything.
     return torch.where(share < PILOT_LEAST_SHARE, limit, (HEADROOM * nearest).clamp(least, limit))
 

@@ -33,10 +33,10 @@ class CostVolume:
     levels: Tensor  # (D, H, W) uint8
     in_view: Tensor  # (D, H, W) bool, at least one right view sees the pixel on this plane
     inverse_depth: Tensor  # (D,) float32, 1/m, ascending and evenly spaced; on the CPU, as every camera here
-    K: Tensor  # (3, 3) pixels of this grid
     left_01: Tensor  # (1, H, W) grey left image on this grid
-    rights: tuple[CameraView, ...]  # grey, at the resolution of the sweep
-    aligned: tuple[AlignedView, ...]  # the same, turned parallel to the left view
+    aligned: tuple[AlignedView, ...]  # the right ones, turned parallel to it
+    rays: tuple[PlaneRays, ...]  # of some pixels through each right camera, for medians over the grid
+    rectified: bool  # whether every right view is rectified with the left one
 
     def at_pixels(self, index: Tensor) -> tuple[Tensor, Tensor]:
         """``cost (D, P)`` in [0, 1] and ``in_view (D, P)`` bool of pixels ``(P,)``: ``row * W + column``."""
@@ -54,15 +54,9 @@ class CostVolume:
         return self.inverse_depth[1] - self.inverse_depth[0]
 
     @cached_property
-    def rectified(self) -> bool:
-        """Whether every right view is rectified with the left one."""
-        return all(bool(is_rectified(self.K, K, T)) for _, K, T in self.rights)
-
-    @cached_property
     def reach_m(self) -> tuple[float, float]:
         """Metres of the nearest plane, and of a shift of 0.3 px, beyond which depth cannot be measured."""
-        all_rays = [sampled_rays(self.K, K, T, self.size) for _, K, T in self.rights]
-        farthest = max(1.0 / float(inverse_depth_at_shift(rays, _LEAST_SHIFT_PX)) for rays in all_rays)
+        farthest = max(1.0 / float(inverse_depth_at_shift(rays, _LEAST_SHIFT_PX)) for rays in self.rays)
         return 1.0 / float(self.inverse_depth[-1]), farthest
 
 
@@ -122,11 +116,14 @@ def sweep_planes(
     mean over the views that see the pixel. ``inverse_depth (D,)`` 1/m is ascending and even, D >= 2. The
     reference computes planes one by one, so that memory is that of the result, two bytes per pixel and plane.
     """
-    size, planes = image_size(left_01), inverse_depth.cpu()
+    size, planes, K = image_size(left_01), inverse_depth.cpu(), K_left.cpu()
     aligned = tuple(align_view(right, K_left, size, planes) for right in rights)
     left = grey_levels(F.pad(left_01[None], (MARGIN_PX,) * 4, mode="replicate")[0, 0])
     compare = _all_planes if use_kernel(left) else _plane_by_plane
-    return CostVolume(*compare(left, aligned), planes, K_left.cpu(), left_01, tuple(rights), aligned)
+    levels, in_view = compare(left, aligned)
+    rays = tuple(sampled_rays(K, K_right, T, size) for _, K_right, T in rights)
+    rectified = all(bool(is_rectified(K, K_right, T)) for _, K_right, T in rights)
+    return CostVolume(levels, in_view, planes, left_01, aligned, rays, rectified)
 
 
 def _plane_by_plane(left: Tensor, views: Sequence[AlignedView]) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number
 from geodiff_plugin.priors.loading import Layout, build_pipeline
-from geodiff_plugin.scale.space import SPACES
+from geodiff_plugin.scale.space import SPACES, DepthRange, PriorMaps
 
 Condition = dict[str, Tensor]
 Generators = torch.Generator | list[torch.Generator] | None
@@ -97,6 +97,13 @@ class DepthPrior:
         """What the decoded map is affine in, key of ``SPACES``; depth if the config has none."""
         space = self.config.get("prediction_type") or "depth"
         return check_choice(space, "the pipeline's prediction_type", SPACES)
+
+    def maps_of(self, samples: slice) -> PriorMaps:
+        """What is known of the maps of some of the ``N * E`` samples, once the call has seen its images."""
+        depth_range = None
+        if self.metric_range is not None:  # nearest first: of disparity that is at x = 1
+            depth_range = DepthRange(*self.metric_range[samples].T.sort(0).values)
+        return PriorMaps(self.space, None if self.valid is None else self.valid[samples], depth_range)
 
     @property
     def network_input(self) -> slice | None:

@@ -63,21 +63,24 @@ class ProcessingGrid:
 
 
 class MapCodec:
-    """Decodes and encodes relative maps of a guided call; ``tiny`` stands in for the pipeline's VAE."""
+    """A pipeline and its prior as a guided call uses them: it decodes and encodes relative maps on a grid.
 
-    def __init__(self, pipe: Any, prior: DepthPrior, grid: ProcessingGrid, tiny: Any | None) -> None:
-        self._pipe, self.prior, self.grid, self.tiny = pipe, prior, grid, tiny
+    ``tiny`` stands in for the pipeline's VAE.
+    """
+
+    def __init__(self, pipe: Any, prior: DepthPrior, grid: ProcessingGrid, tiny: Any | None = None) -> None:
+        self.pipe, self.prior, self.grid, self.tiny = pipe, prior, grid, tiny
 
     @contextmanager
     def _autoencoder(self, tiny: Any | None) -> Iterator[None]:
-        original = getattr(self._pipe, "vae", None)
+        original = getattr(self.pipe, "vae", None)
         if tiny is not None:  # past ``__setattr__``, which would rewrite the pipeline's config
-            object.__setattr__(self._pipe, "vae", tiny)
+            object.__setattr__(self.pipe, "vae", tiny)
         try:
             yield
         finally:
             if tiny is not None:
-                object.__setattr__(self._pipe, "vae", original)
+                object.__setattr__(self.pipe, "vae", original)
 
     def decode(self, z0: Tensor, final: bool = False) -> Tensor:
         """Unclipped relative map ``(B, 1, H, W)`` float32 of a clean latent's depth channels, differentiable.

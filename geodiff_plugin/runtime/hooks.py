@@ -11,7 +11,7 @@ import functools
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from typing import Any
+from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
 import torch
@@ -20,6 +20,7 @@ from torch import Tensor
 from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.runtime.noise_levels import trailing_timesteps
 
+_Answer = TypeVar("_Answer")
 _LOCKS: WeakKeyDictionary[Any, threading.RLock] = WeakKeyDictionary()
 _LOCKS_GUARD = threading.Lock()
 
@@ -103,14 +104,17 @@ class Exclusive:
     def __exit__(self, *exc: object) -> None:
         self._stack.close()
 
-    @contextmanager
-    def given_back(self) -> Iterator[None]:
-        """Release all locks inside the context, and wait for them at its end."""
-        self.__exit__()
-        try:
-            yield
-        finally:
-            self.__enter__()
+    def without(self, function: Callable[..., _Answer]) -> Callable[..., _Answer]:
+        """The function, called with all locks released; it waits for them before it returns."""
+
+        def unlocked(*args: Any, **kwargs: Any) -> _Answer:
+            self.__exit__()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.__enter__()
+
+        return unlocked
 
 
 class DenoiserTap:

@@ -26,11 +26,11 @@ from geodiff_plugin.priors import DepthPrior, prior_of
 from geodiff_plugin.priors.pipeline import RESAMPLING, DepthDiffusionPipeline
 from geodiff_plugin.result.ensemble import ensemble_metric
 from geodiff_plugin.result.output import image_labels
-from geodiff_plugin.runtime.estimate import ProcessingGrid, tiny_autoencoder
+from geodiff_plugin.runtime.estimate import MapCodec, ProcessingGrid, tiny_autoencoder
 from geodiff_plugin.runtime.graphs import FasterNetworks
 from geodiff_plugin.runtime.hooks import Exclusive, networks_of
 from geodiff_plugin.runtime.noise_levels import check_scheduler
-from geodiff_plugin.runtime.run import GuidedRun, RunInputs, StepCallback
+from geodiff_plugin.runtime.run import GuidedRun, StepCallback
 
 #: What every stock pipeline's call takes, whatever the prior.
 STOCK_ARGUMENTS = (
@@ -123,11 +123,12 @@ class GuidedCall(_Stock):
         call |= {"num_inference_steps": steps, "resample_method_output": resampling}
         _check_guidable(self, prior, guidance)
         tiny = tiny_autoencoder(self, guidance.config.decoder)
+        unlocked = None if callback is None else held.without(callback)
         if prior.deterministic and call["ensemble_size"] > 1:
             call |= _one_member(call)
         device = self._execution_device
         lefts_01 = lefts_01.to(device)
-        grid = self._processing_grid(lefts_01, call, device)
+        codec = MapCodec(self, prior, self._processing_grid(lefts_01, call, device), tiny)
         guidance.check_left_images(lefts_01)
         evidence = Beside(lambda: _prepared(guidance, lefts_01), device)
         try:
@@ -136,19 +137,19 @@ class GuidedCall(_Stock):
             # Channels last, as the stock call reads pictures; with given latents Marigold does not accept it.
             layout = torch.channels_last if call["latents"] is None else torch.contiguous_format
             call["image"] = lefts_01.contiguous(memory_format=layout)
-            inputs = RunInputs(guidance, evidence.result, call, grid, rounds)
-            run, stock = self._run_stock(GuidedRun(self, prior, inputs, callback, tiny, held), call)
+            run = GuidedRun(codec, guidance, evidence.result, call, rounds, unlocked)
+            stock = self._run_stock(run, call)
         finally:
             evidence.close()
         run.check_finite()
         return run, stock
 
-    def _run_stock(self, run: GuidedRun, call: dict[str, Any]) -> tuple[GuidedRun, Any]:
-        """The stock call within a run; both, for the result."""
+    def _run_stock(self, run: GuidedRun, call: dict[str, Any]) -> Any:
+        """The stock call within a run."""
         fixed = {"return_dict": True, "output_latent": True, "output_type": "pt"}
         try:
             with run:
-                return run, super().__call__(**call | fixed)
+                return super().__call__(**call | fixed)
         finally:
             run.release()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,60 +14,51 @@ from tqdm.auto import tqdm
 from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.algorithm.member import Member
 from geodiff_plugin.algorithm.schedule import Schedule, make_schedule
-from geodiff_plugin.algorithm.settling import Samples
 from geodiff_plugin.algorithm.state import Trajectory
 from geodiff_plugin.algorithm.step import guided_step
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.messages import Message
-from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.result.finish import ResultOptions, finish
 from geodiff_plugin.result.output import stack_results
 from geodiff_plugin.runtime import hooks
-from geodiff_plugin.runtime.estimate import MapCodec, ProcessingGrid, StepEstimate, StepInputs
+from geodiff_plugin.runtime.estimate import MapCodec, StepEstimate, StepInputs
 from geodiff_plugin.runtime.noise_levels import noise_level
 from geodiff_plugin.types import MetricDepthOutput
 
 StepCallback = Callable[[Any, int, Any, dict[str, Tensor | None]], dict[str, Tensor] | None]
 
 
-@dataclass(frozen=True)
-class RunInputs:
-    """What a guided call starts from: act 1's evidence, and the stock call that act 2 runs in."""
-
-    guidance: GeometryGuidance
-    evidence: Callable[[], Sequence[Evidence]]  # one per image; may have to be waited for
-    call: Mapping[str, Any]  # arguments of the stock call
-    grid: ProcessingGrid
-    rounds: int = 1  # in each denoising step
-
-
 class GuidedRun:
     """State of one guided call.
 
-    ``tiny`` is the autoencoder in place of the pipeline's. ``held``, the locks of the call, are released
-    while the ``callback`` runs.
+    Args:
+        codec: the pipeline, its prior and the grid that the stock call denoises on.
+        guidance: what the user gave.
+        evidence: gives act 1's answer, one per image; it may have to wait for it.
+        call: arguments of the stock call that act 2 runs in.
+        rounds: of guidance in each denoising step.
+        callback: the user's, which runs while the pipeline has no hooks.
     """
 
     def __init__(
         self,
-        pipe: Any,
-        prior: DepthPrior,
-        inputs: RunInputs,
+        codec: MapCodec,
+        guidance: GeometryGuidance,
+        evidence: Callable[[], Sequence[Evidence]],
+        call: Mapping[str, Any],
+        rounds: int = 1,
         callback: StepCallback | None = None,
-        tiny: Any | None = None,
-        held: hooks.Exclusive | None = None,
     ) -> None:
-        guidance, call = inputs.guidance, inputs.call
-        self.pipe, self.prior, self.config, self.inputs = pipe, prior, guidance.config, inputs
+        self.pipe, self.prior, self.config = codec.pipe, codec.prior, guidance.config
+        self.guidance, self.call, self._evidence = guidance, call, evidence
         self._image_of_sample = [i for i in range(len(guidance.inputs)) for _ in range(call["ensemble_size"])]
         self.schedule: Schedule | None = None
         self.trajectories: list[Trajectory] = []  # one per chunk, made at its first guided step
         self.members: list[Member] = []  # of all images, those of one image side by side
-        self._plan = guidance.updates
-        self._callback, self._held = callback, held
+        self._plan, self._rounds, self._callback = guidance.updates, rounds, callback
         self._reads_latents = call["output_latent"] or callback is not None
-        self._codec = MapCodec(pipe, prior, inputs.grid, tiny)
+        self._codec = codec
         self._chunk, self._step = -1, 0
         self._first_output: Tensor | None = None  # the network's, of the first step of the chunk
         self._timesteps: list[float] = []
@@ -77,9 +67,9 @@ class GuidedRun:
         self._decoded = 0  # chunks whose final latents were decoded
         self._stack, self._bar = ExitStack(), None
         self._tap = None
-        if guidance.through_network and prior.network_input is not None:
-            self._tap = hooks.DenoiserTap(*prior.network(), prior.network_input)
-        self._scheduler = hooks.GuidedScheduler(pipe, self, self.config.respace)
+        if guidance.through_network and self.prior.network_input is not None:
+            self._tap = hooks.DenoiserTap(*self.prior.network(), self.prior.network_input)
+        self._scheduler = hooks.GuidedScheduler(self.pipe, self, self.config.respace)
 
     def __enter__(self) -> GuidedRun:
         with ExitStack() as stack:
@@ -108,11 +98,9 @@ class GuidedRun:
     @contextmanager
     def _suspended(self) -> Iterator[None]:
         """Remove the hooks while a callback runs, so that it may call or save the pipeline."""
-        assert self._held is not None  # a callback comes with the lock
         self._stack.close()
         try:
-            with self._held.given_back():
-                yield
+            yield
         finally:
             self.__enter__()
 
@@ -122,7 +110,7 @@ class GuidedRun:
         self._decoded += 1
         if x is None:  # otherwise skip decoding, which adds the autoencoder's loss
             x = self.prior.decode(latents[:, self.prior.depth_channels]).float()
-        grid = self.inputs.grid
+        grid = self._codec.grid
         x = grid.padded(x)
         depth_m = trajectory.result(x)
         self.members += trajectory.members(grid.cropped(x), depth_m)
@@ -133,7 +121,7 @@ class GuidedRun:
 
         ``warned`` are the warnings so far; those that forbid trust are reasons of the verdict.
         """
-        guidance, call = self.inputs.guidance, self.inputs.call
+        guidance, call = self.guidance, self.call
         size, count = call["ensemble_size"], len(guidance.inputs)
         members = [self.members[first : first + size] for first in range(0, count * size, size)]
         options = ResultOptions(
@@ -144,7 +132,7 @@ class GuidedRun:
             doubts=tuple(message for message in warned if message.forbids_trust),
         )
         spreads = [None] * count if stock.uncertainty is None else stock.uncertainty.split(1)
-        of_images = zip(self.inputs.evidence(), members, stock.prediction.split(1), spreads, strict=True)
+        of_images = zip(self._evidence(), members, stock.prediction.split(1), spreads, strict=True)
         return stack_results(
             [finish(*of_image, options) for of_image in of_images],
             guidance,
@@ -166,22 +154,24 @@ class GuidedRun:
         self._step, self._timesteps = 0, timesteps.tolist()
         self._shown = self._first_output = None
         if self.schedule is None:
-            rounds, encodes, count = self.inputs.rounds, self._tap is None, len(timesteps)
+            rounds, encodes, count = self._rounds, self._tap is None, len(timesteps)
             self.schedule = make_schedule(self.config, self._plan, count, rounds=rounds, encodes=encodes)
             options = {"desc": "guided steps", **getattr(self.pipe, "_progress_bar_config", {})}
-            chunks = -(-len(self._image_of_sample) // self.inputs.call["batch_size"])
+            chunks = -(-len(self._image_of_sample) // self.call["batch_size"])
             self._bar = tqdm(total=chunks * len(timesteps), **options)
 
     def _trajectory(self) -> Trajectory:
         """The trajectory of the current chunk; the first one waits for the evidence, if it is still made."""
         if len(self.trajectories) <= self._chunk:
-            size, prior, metres = self.inputs.call["batch_size"], self.prior, self.prior.metric_range
+            size = self.call["batch_size"]
             chunk = slice(self._chunk * size, (self._chunk + 1) * size)
-            images, evidence = self._image_of_sample[chunk], self.inputs.evidence()
-            valid = None if prior.valid is None else prior.valid[chunk]
-            samples = Samples(tuple(images), tuple(evidence[i] for i in images), valid)
-            prior_range = None if metres is None else (metres[chunk, 0], metres[chunk, 1])
-            trajectory = Trajectory(self.config, samples, prior.space, self._plan.step_latents, prior_range)
+            trajectory = Trajectory(
+                self.config,
+                self._evidence(),
+                self._image_of_sample[chunk],
+                self.prior.maps_of(chunk),
+                self._plan.step_latents,
+            )
             if self._first_output is not None:
                 trajectory.step = 0, self._timesteps[0]
                 trajectory.note("the prior's output", self._first_output)

@@ -82,6 +82,15 @@ class DepthRange(NamedTuple):
 
 
 @dataclass(frozen=True)
+class PriorMaps:
+    """What is known beforehand of the relative maps of some samples, from the prior that makes them."""
+
+    space: str  # what they are affine in, key of ``SPACES``
+    valid: Tensor | None = None  # (B, 1, h, w) bool, where they say something; ``None`` for everywhere
+    depth_range: DepthRange | None = None  # a metric prior's
+
+
+@dataclass(frozen=True)
 class Space:
     """What a prior's output is affine in: ``v = s x + t`` is a function of depth in units of g_s.
 

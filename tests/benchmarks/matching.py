@@ -17,11 +17,13 @@ import torch.nn.functional as F
 from rich.console import Console
 from rich.table import Table
 
+from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.formats import as_image_01
-from geodiff_plugin.geometry import plane_rays, warp_right_to_left
+from geodiff_plugin.geometry import warp_right_to_left
 from geodiff_plugin.matching.aggregation import aggregate
-from geodiff_plugin.matching.build import build_cost_volume, inverse_pose_preferred, pilot_volume
+from geodiff_plugin.matching.build import build_cost_volume, inverse_pose_preferred, pilot_volume, to_grid
+from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.sweep import CostVolume, median_shift, sweep_planes
 from geodiff_plugin.types import CameraView
@@ -123,7 +125,8 @@ def measure(pair: Pair, device: str = "cpu", repeats: int = 3) -> tuple[dict[str
     """
     left, right, K = pair
     volume = build_cost_volume(left, [right], K)
-    matches = match_volume(volume)
+    matches, (image, *cameras) = match_volume(volume), right
+    swept = to_grid(grey(left), [CameraView(grey(image), *cameras)], K, DEFAULT.sweep_pixels)
 
     def evidence() -> None:
         found = match_volume(build_cost_volume(left, [right], K))
@@ -132,7 +135,7 @@ def measure(pair: Pair, device: str = "cpu", repeats: int = 3) -> tuple[dict[str
     stages: dict[str, Callable[[], object]] = {
         "coarse sweep": lambda: pilot_volume(left, [right], K),
         "volume": lambda: build_cost_volume(left, [right], K),
-        "sweep": lambda: sweep_planes(volume.left_01, volume.rights, volume.K, volume.inverse_depth),
+        "sweep": lambda: sweep_planes(*swept, volume.inverse_depth),
         "one aggregation": lambda: aggregate(volume.levels, volume.left_01[0]),
         "matches": lambda: match_volume(volume),
         "swapped?": lambda: inverse_pose_preferred(left, [right], K, matches),
@@ -144,9 +147,7 @@ def measure(pair: Pair, device: str = "cpu", repeats: int = 3) -> tuple[dict[str
 
 def disparities_of(volume: CostVolume, width: int) -> int:
     """As many whole pixels of the image as the planes span for the median pixel, a multiple of 16."""
-    _, K_right, T = volume.rights[0]
-    rays = plane_rays(volume.K[None], K_right[None], T[None], volume.size)
-    near = float(median_shift(rays, volume.inverse_depth[-1:])) * width / volume.size[1]
+    near = float(median_shift(volume.rays[0], volume.inverse_depth[-1:])) * width / volume.size[1]
     return 16 * math.ceil(min(near, width / 2) / 16) if math.isfinite(near) else 128
 
 

@@ -178,7 +178,7 @@ def cost_volume() -> dict[str, object]:
         result |= {f"{name}_planes": made.inverse_depth, f"{name}_in_view": made.in_view}
         for k, share in enumerate((0.0, 0.35, 0.7, 1.0)):
             result[f"{name}_levels_{k}"] = made.levels[round(share * (len(made.levels) - 1))]
-        result |= {f"{name}_grey": made.left_01, f"{name}_right_0": made.rights[0].image_01}
+        result |= {f"{name}_grey": made.left_01, f"{name}_right_0": made.aligned[0].grey[None]}
         result[f"{name}_kind"] = f"rectified {made.rectified}, {len(made.levels)} planes"
     return result
 

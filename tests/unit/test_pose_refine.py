@@ -270,8 +270,9 @@ def test_everything_downstream_sees_the_refined_pose(pair) -> None:
     assert "px off their epipolar lines" in report.warnings[0]
     assert angle_deg(report.E[0][:3, :3].T @ true[:3, :3]) < 0.2
     assert np.allclose(E, report.E[0], atol=1e-5) and np.allclose(report.E_given[0], wrong, atol=1e-6)
-    for T in (refined.grid.views[0][2], refined.volume.rights[0][2]):
-        assert np.allclose(np.linalg.inv(T.numpy()), E, atol=1e-6)
+    _, K_right, T = refined.grid.views[0]
+    assert np.allclose(np.linalg.inv(T.numpy()), E, atol=1e-6)
+    assert torch.allclose(refined.volume.rays[0].centre, K_right @ T[:3, 3:])
     assert given.pose.status == "given"
     assert np.allclose(np.linalg.inv(given.native.views[0][2].numpy()), wrong, atol=1e-5)
 
