@@ -56,7 +56,8 @@ MUTANTS = [
         "geometry.py",
         ("rays[..., :1] - (slant", "rays[..., :1] + (slant"),
         ("in_front = z > NEAREST_M", "in_front = z.abs() > NEAREST_M"),
-        ("M = K_right @ T", "M = K_left @ T"),
+        ("M = K_right @ T_right_from_left[:, :3, :3]", "M = K_left @ T_right_from_left[:, :3, :3]"),
+        ("M = K_right @ T_right_from_left[:3, :3]", "M = K_left @ T_right_from_left[:3, :3]"),
         ("fx * x + skew * y + cx", "fx * x + cx"),
         ("max(width - 1, 1), max(height - 1, 1)", "max(width, 1), max(height, 1)"),
         ("v <= size[0] - 1 + EDGE_PX", "v <= size[1] - 1 + EDGE_PX"),
@@ -67,7 +68,7 @@ MUTANTS = [
     ),
     *of(
         "matching/census.py",
-        ("[0.299, 0.587, 0.114]", "[0.114, 0.587, 0.299]"),
+        ("_LUMA = 0.299, 0.587, 0.114", "_LUMA = 0.114, 0.587, 0.299"),
         ("_CONTRAST = 6.0 / 255.0", "_CONTRAST = 8.0 / 255.0"),
         ("(2 * stride, 2, stride, 1)", "(stride, 1, stride, 1)"),
     ),
