@@ -37,6 +37,15 @@ def use_kernel(tensor: torch.Tensor) -> bool:
     return _switched_on.get() and has_triton() and (on_device or interpreting())
 
 
+def launch_bound(tensor: torch.Tensor) -> bool:
+    """Whether small operations on ``tensor`` take the time of their launches, so that few large ones pay.
+
+    On a CPU many small ones pay, which stay in its caches. As kernels do, such a stage takes the way of a
+    device in Triton's interpreter, where tests compare both.
+    """
+    return tensor.device.type != "cpu" or interpreting()
+
+
 def kernels_in_use() -> str:
     """Whether stages run by kernels on this machine, and if not, why; for ``geodiff info``."""
     if not has_triton():

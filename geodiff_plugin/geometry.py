@@ -172,22 +172,6 @@ def rays_of(like: Tensor, K_left: Tensor, K_right: Tensor, T_right_from_left: Te
     return plane_rays(K_left, K_right, T, image_size(like))
 
 
-def sampled_rays(
-    K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor, size: tuple[int, int]
-) -> PlaneRays:
-    """``plane_rays`` of 1024 to 2047 pixels of a grid ``(H, W)``, or of all if it has fewer, one camera each.
-
-    ``K (3, 3)``, ``T (4, 4)``. They are enough for medians over the grid.
-    """
-    pixels = size[0] * size[1]
-    at = torch.arange(0, pixels, max(1, pixels // 1024), device=K_left.device)
-    y = ((at // size[1]).to(K_left) - K_left[1, 2]) / K_left[1, 1]
-    x = ((at % size[1]).to(K_left) - K_left[0, 2]) / K_left[0, 0] - K_left[0, 1] / K_left[0, 0] * y
-    M = K_right @ T_right_from_left[:3, :3]
-    infinity = M[:, 2:] + M[:, 1:2] * y + M[:, :1] * x
-    return PlaneRays(infinity[None], (K_right @ T_right_from_left[:3, 3:])[None])
-
-
 def project_rays(depth_m: Tensor, rays: PlaneRays) -> tuple[Tensor, Tensor]:
     """Pixels ``(B, H, W, 2)`` and depth in the right view ``(B, H, W)`` of a left depth map, as ``project``.
 

@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._kernels import launch_bound
 from geodiff_plugin.algorithm.solver import solve_robust
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.geometry import image_size
@@ -174,14 +175,22 @@ def off_edges(target: Matches, depth_m: Tensor, error: Tensor) -> Matches:
     size = target.size
     log_depth = _log_depth(depth_m, size)
     reach = max(1, round(EDGE_REACH * max(size)))
-    span = highest(log_depth, reach) + highest(-log_depth, reach)
+    span = range_around(log_depth, reach)
     width = EDGE_STEP * (_on_grid(error, size) / EDGE_ERROR).clamp_min(1.0) ** 3
     return replace(target, confidence=target.confidence / (1.0 + (span / width) ** 2))
+
+
+def range_around(values: Tensor, reach: int) -> Tensor:
+    """The largest less the least value of a square window, of a map ``(B, 1, H, W)``."""
+    return highest(torch.cat([values, -values], 1), reach).sum(1, keepdim=True)
 
 
 def highest(values: Tensor, reach: int) -> Tensor:
     """The largest value of a square window, rows and columns one after the other, by windows that double."""
     side = 2 * reach + 1
+    if launch_bound(values):
+        across = F.max_pool2d(values, (1, side), 1, (0, reach))
+        return F.max_pool2d(across, (side, 1), 1, (reach, 0))
     values = F.pad(values, (reach,) * 4, mode="replicate")
     for axis in (-1, -2):
         covered = 1

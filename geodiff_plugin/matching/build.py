@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -11,11 +10,12 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.geometry import PlaneRays, as_fine_as, image_size, resize_image, sampled_rays
+from geodiff_plugin.geometry import as_fine_as, image_size, resize_image
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
-from geodiff_plugin.matching.sweep import CostVolume, inverse_depth_at_shift, median_shift, sweep_planes
+from geodiff_plugin.matching.planes import even_planes, parallax_of
+from geodiff_plugin.matching.sweep import CostVolume, sweep_planes
 from geodiff_plugin.types import CameraView
 
 # With fewer planes, a parabola through three neighbouring costs fits nothing.
@@ -72,24 +72,6 @@ def _grey_views(views: Sequence[CameraView]) -> tuple[CameraView, ...]:
     return tuple(CameraView(grey(image), _on_cpu(K), _on_cpu(T)) for image, K, T in views)
 
 
-def _even_planes(
-    span: tuple[Tensor, Tensor],
-    size: tuple[int, int],
-    rights: Sequence[CameraView],
-    K: Tensor,
-    step_px: float,
-    most: int,
-) -> Tensor:
-    """Inverse depths over ``span``; from one to the next the median pixel moves by ``step_px``."""
-    ends = torch.stack(list(span))
-    shifts = [median_shift(sampled_rays(K, K_r, T, size), ends) for _, K_r, T in rights]
-    moved = max(float(shift[1] - shift[0]) for shift in shifts)
-    wanted = round(moved / step_px) + 1 if math.isfinite(moved) else most  # not finite behind a camera
-    count = min(max(wanted, _FEWEST_PLANES), most)
-    steps = torch.linspace(0.0, 1.0, count, dtype=ends.dtype, device=ends.device)
-    return ends[0] + (ends[1] - ends[0]) * steps
-
-
 @torch.no_grad()
 def pilot_volume(
     left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, pixels: int = PILOT_PIXELS
@@ -99,35 +81,26 @@ def pilot_volume(
     Its grid has at most ``pixels`` pixels. Other arguments and errors as for ``build_cost_volume``.
     """
     left, small, K = to_grid(grey(left_01), _grey_views(rights), _on_cpu(K_left), pixels)
-    size = image_size(left)
-    each = _at_shift([sampled_rays(K, K_r, T, size) for _, K_r, T in small], PILOT_SHIFT * size[1])
-    limit = torch.minimum(each.amax(), MOST_NEARER * each.amin())
-    span = (torch.zeros_like(limit), limit)
-    planes = _even_planes(span, size, small, K, PILOT_STEP_PX, PILOT_PLANES)
+    views = parallax_of(small, K, image_size(left))
+    nearest = [view.inverse_depth_at(PILOT_SHIFT * left.shape[-1]) for view in views]
+    limit = min(max(nearest), MOST_NEARER * min(nearest))
+    planes = even_planes(views, (0.0, limit), PILOT_STEP_PX, _FEWEST_PLANES, PILOT_PLANES)
     return sweep_planes(left, small, K, planes)
 
 
-def _at_shift(rays: Sequence[PlaneRays], shift_px: float) -> Tensor:
-    """``(V,)`` inverse depths at which each view has moved by so many pixels."""
-    nearest = []
-    for v, of_view in enumerate(rays, 1):
-        name = "E" if len(rays) == 1 else f"E of right view {v}"
-        nearest.append(inverse_depth_at_shift(of_view, shift_px, name))
-    return torch.stack(nearest)
-
-
-def _nearest_inverse_depth(pilot: CostVolume) -> Tensor:
+def _nearest_inverse_depth(pilot: CostVolume) -> float:
     """The inverse depth at which the planes end, somewhat nearer than the matches of a coarse sweep."""
     matches = match_volume(pilot)
     reliable = matches.confidence > PILOT_CONFIDENCE
     inverse_depth = torch.where(reliable, matches.inverse_depth, torch.nan)
     # The one number of a sweep for which the device is waited for: how near the planes reach.
     read = torch.stack([torch.nanquantile(inverse_depth, PILOT_QUANTILE), reliable.float().mean()])
-    nearest, share = read.cpu()
-    limit = pilot.inverse_depth[-1]
-    least = _at_shift(pilot.rays, LEAST_SHIFT * pilot.size[1]).amin()
-    # With few reliable matches the planes must span everything.
-    return torch.where(share < PILOT_LEAST_SHARE, limit, (HEADROOM * nearest).clamp(least, limit))
+    nearest, share = read.tolist()
+    limit = float(pilot.inverse_depth[-1])
+    if share < PILOT_LEAST_SHARE:  # then the planes must span everything
+        return limit
+    least = min(view.inverse_depth_at(LEAST_SHIFT * pilot.size[1]) for view in pilot.parallax)
+    return min(max(HEADROOM * nearest, least), limit)
 
 
 @torch.no_grad()
@@ -149,11 +122,11 @@ def build_cost_volume(
         bad_value("depth_range", "(near, far) in metres with 0 < near < far", depth_range)
     left, small, K = to_grid(grey(left_01), _grey_views(rights), _on_cpu(K_left), config.sweep_pixels)
     if depth_range is None:
-        nearest = _nearest_inverse_depth(pilot_volume(left, small, K))
-        span = (torch.zeros_like(nearest), nearest)
+        span = 0.0, _nearest_inverse_depth(pilot_volume(left, small, K))
     else:
-        span = (K.new_tensor(1.0 / depth_range[1]), K.new_tensor(1.0 / depth_range[0]))
-    planes = _even_planes(span, image_size(left), small, K, PLANE_STEP_PX, config.planes)
+        span = 1.0 / depth_range[1], 1.0 / depth_range[0]
+    views = parallax_of(small, K, image_size(left))
+    planes = even_planes(views, span, PLANE_STEP_PX, _FEWEST_PLANES, config.planes)
     return sweep_planes(left, small, K, planes)
 
 

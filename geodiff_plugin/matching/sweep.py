@@ -10,16 +10,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._checks import bad_value
 from geodiff_plugin._kernels import use_kernel
-from geodiff_plugin.geometry import NEAREST_M, PlaneRays, image_size, is_rectified, sampled_rays
+from geodiff_plugin.geometry import image_size, is_rectified
 from geodiff_plugin.matching.aggregation import empty_volume
 from geodiff_plugin.matching.alignment import AlignedView, ComparedView, align_view
 from geodiff_plugin.matching.census import COST_LEVELS, MARGIN_PX, census, grey_levels
+from geodiff_plugin.matching.planes import LEAST_SHIFT_PX, Parallax, parallax_of
 from geodiff_plugin.matching.winner import UNSEEN_LEVEL
 from geodiff_plugin.types import CameraView
-
-_LEAST_SHIFT_PX = 0.3
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,7 @@ class CostVolume:
     inverse_depth: Tensor  # (D,) float32, 1/m, ascending and evenly spaced; on the CPU, as every camera here
     left_01: Tensor  # (1, H, W) grey left image on this grid
     aligned: tuple[AlignedView, ...]  # the right ones, turned parallel to it
-    rays: tuple[PlaneRays, ...]  # of some pixels through each right camera, for medians over the grid
+    parallax: tuple[Parallax, ...]  # of each right view, on this grid
     rectified: bool  # whether every right view is rectified with the left one
 
     def at_pixels(self, index: Tensor) -> tuple[Tensor, Tensor]:
@@ -56,54 +54,8 @@ class CostVolume:
     @cached_property
     def reach_m(self) -> tuple[float, float]:
         """Metres of the nearest plane, and of a shift of 0.3 px, beyond which depth cannot be measured."""
-        farthest = max(1.0 / float(inverse_depth_at_shift(rays, _LEAST_SHIFT_PX)) for rays in self.rays)
+        farthest = max(1.0 / view.inverse_depth_at(LEAST_SHIFT_PX) for view in self.parallax)
         return 1.0 / float(self.inverse_depth[-1]), farthest
-
-
-def _plane_uv(rays: PlaneRays, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Right pixels ``(D, 2, N)`` of every left pixel on every plane, and ``(D, N)`` if it is in front."""
-    p = rays.infinity + inverse_depth[:, None, None] * rays.centre  # the line in z, divided by z
-    in_front = p[:, 2] > NEAREST_M
-    return p[:, :2] / torch.where(in_front, p[:, 2], torch.ones_like(p[:, 2]))[:, None], in_front
-
-
-def median_shift(rays: PlaneRays, inverse_depth: Tensor, name: str = "E") -> Tensor:
-    """How far the median pixel lies, in the right view, from where it would be at infinity, ``(N,)`` pixels.
-
-    A rotation, which moves all depths alike, does not count. Infinite where the plane of ``inverse_depth
-    (N,)`` passes behind the right camera. ``InputError`` that names the pose where no pixel's point at
-    infinity is in front of it.
-    """
-    step = max(1, rays.infinity.shape[-1] // 1024)
-    some = rays._replace(infinity=rays.infinity[..., ::step])
-    at_infinity, ahead = _plane_uv(some, rays.infinity.new_zeros(1))
-    if not ahead.any():
-        bad_value(name, "a pose under which the views overlap", "a right camera that looks the other way")
-    uv, in_front = _plane_uv(some, inverse_depth)
-    dx, dy = (uv - at_infinity).unbind(dim=1)
-    shift = torch.hypot(dx, dy)  # torch's norm over a dimension of 2 would take most of a sweep's time
-    shift = torch.where(in_front, shift, torch.full_like(shift, torch.inf))
-    return shift[:, ahead[0]].median(dim=1).values
-
-
-def inverse_depth_at_shift(rays: PlaneRays, shift_px: float, name: str = "E") -> Tensor:
-    """The inverse depth, ``()`` 1/m within 1 %, at which ``median_shift`` reaches ``shift_px`` > 0.
-
-    If one camera stands behind the other, pixels move to the epipole at most, so ``shift_px`` is bounded by
-    half of that way. ``InputError`` also where both cameras stand at one place.
-    """
-    exponents = rays.infinity.new_tensor([-8.0, 5.0])
-    most = float(median_shift(rays, 10.0 ** exponents[1:], name))
-    if most < _LEAST_SHIFT_PX:
-        bad_value(name, "a pose with a baseline", "both cameras at one place")
-    shift_px = min(shift_px, 0.5 * most)
-    for _ in range(16):  # the shift grows with inverse depth, so bisection of 13 decades reaches 0.05 %
-        middle = exponents.mean()
-        reached = median_shift(rays, 10.0 ** middle[None])[0] >= shift_px
-        exponents = torch.where(
-            reached, torch.stack([exponents[0], middle]), torch.stack([middle, exponents[1]])
-        )
-    return 10.0 ** exponents[1]
 
 
 @torch.no_grad()
@@ -121,9 +73,8 @@ def sweep_planes(
     left = grey_levels(F.pad(left_01[None], (MARGIN_PX,) * 4, mode="replicate")[0, 0])
     compare = _all_planes if use_kernel(left) else _plane_by_plane
     levels, in_view = compare(left, aligned)
-    rays = tuple(sampled_rays(K, K_right, T, size) for _, K_right, T in rights)
     rectified = all(bool(is_rectified(K, K_right, T)) for _, K_right, T in rights)
-    return CostVolume(levels, in_view, planes, left_01, aligned, rays, rectified)
+    return CostVolume(levels, in_view, planes, left_01, aligned, parallax_of(rights, K, size), rectified)
 
 
 def _plane_by_plane(left: Tensor, views: Sequence[AlignedView]) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm.correction import highest
+from geodiff_plugin._kernels import launch_bound
+from geodiff_plugin.algorithm.correction import highest, range_around
 from geodiff_plugin.algorithm.edges import HALF, REACH, STRIP
 from geodiff_plugin.geometry import image_size, is_rectified, resize_image, to_device_of
 from geodiff_plugin.matching import Matches
@@ -65,8 +66,8 @@ SOFT = 4.0
 MOST_SOFT = 0.14
 #: Votes within about this many pixels of the median make the mean.
 NEAR_PX = 1.0
-#: As ``STRIP``, on a GPU, where a launch costs more than a cache gives: some 200 MB of votes.
-STRIP_ON_GPU = 1 << 16
+#: As ``STRIP``, where a launch costs more than a cache gives: some 200 MB of votes.
+STRIP_OF_DEVICE = 1 << 18
 #: Side of the last median filter, pixels of the voting grid.
 MEDIAN = 5
 
@@ -144,9 +145,9 @@ def _resized(image_01: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor
 
 def _median_filtered(values: Tensor) -> Tensor:
     """A map ``(H, W)``, each pixel the median of ``MEDIAN`` times ``MEDIAN`` pixels around it."""
-    if values.device.type == "cpu":  # where OpenCV is many times as fast; another device would be waited for
-        return torch.from_numpy(cv2.medianBlur(np.ascontiguousarray(values.numpy()), MEDIAN))
-    return _median_of_windows(values)
+    if launch_bound(values):
+        return _median_of_windows(values)
+    return torch.from_numpy(cv2.medianBlur(np.ascontiguousarray(values.numpy()), MEDIAN))  # much faster
 
 
 def _median_of_windows(values: Tensor) -> Tensor:
@@ -157,7 +158,7 @@ def _median_of_windows(values: Tensor) -> Tensor:
 
 def _rows_at_once(like: Tensor) -> int:
     """Rows of a map ``(H, W)`` whose windows are worked on at once."""
-    return max(1, (STRIP if like.device.type == "cpu" else STRIP_ON_GPU) // like.shape[-1])
+    return max(1, (STRIP_OF_DEVICE if launch_bound(like) else STRIP) // like.shape[-1])
 
 
 def _error_at_edges(error: Tensor, depth_m: Tensor, spacing: float) -> Tensor:
@@ -174,7 +175,7 @@ def _crispness(depth_m: Tensor) -> Tensor:
     """
     log_depth = depth_m.clamp_min(1e-9).log()[None, None]
     across, down = ((log_depth - log_depth.roll(STEP_PX, axis)).abs() for axis in (-1, -2))
-    near, wide = (highest(log_depth, reach) + highest(-log_depth, reach) for reach in (NEARBY, WIDE))
+    near, wide = (range_around(log_depth, reach) for reach in (NEARBY, WIDE))
     at_edge = (near > EDGE) & (wide < RISE * near)
     step = highest(torch.maximum(across, down), NEARBY)
     share = torch.where(at_edge, step / near, torch.nan)[..., WIDE:-WIDE, WIDE:-WIDE]
@@ -211,27 +212,31 @@ def _vote_in_windows(voters: Sequence[_Votes], left: Tensor, shift: Tensor, map_
     """
     height, width = shift.shape
     halo = HALF * SPACING
-    padded = [
-        F.pad(each.view(1, -1, height, width), (halo,) * 4, mode="replicate")[0]
-        for each in (*(values for pair in voters for values in pair), left)
-    ]
+    layers = torch.stack([values for pair in voters for values in pair])
+    padded = F.pad(torch.cat([layers, left])[None], (halo,) * 4, mode="replicate")[0]
     closeness = [math.exp(-(v**2 + u**2) / (2.0 * REACH**2)) for v, u in WINDOW]
-    out = torch.empty_like(shift)
+    weight_of_map = map_vote * sum(closeness)
     of_window = to_device_of(shift, torch.tensor(closeness, dtype=shift.dtype, device="cpu"))[:, None, None]
+    down, right = to_device_of(shift, torch.tensor(WINDOW, device="cpu").T + HALF)
+    out = torch.empty_like(shift)
     count = _rows_at_once(shift)
     for first in range(0, height, count):
         rows = slice(first, min(height, first + count))
-        around = [
-            [each[:, rows.start + v : rows.stop + v, u : u + width] for each in padded]
-            for v, u in ((halo + SPACING * v, halo + SPACING * u) for v, u in WINDOW)
-        ]
-        unlike = torch.stack([colours for *_, colours in around]).sub_(left[:, rows]).abs_().mean(1)
-        alike = unlike.div_(-BRIGHTNESS).exp_() * of_window
-        votes, weights = [shift[rows][None]], [(map_vote * sum(closeness)).expand_as(shift[rows])[None]]
-        for k in range(len(voters)):
-            votes.append(torch.cat([each[2 * k] for each in around]))
-            weights.append(torch.cat([each[2 * k + 1] for each in around]).mul_(alike))
-        out[rows] = _mean_near_median(torch.cat(votes), torch.cat(weights))
+        part = padded[:, rows.start : rows.stop + 2 * halo]
+        side, (of_layer, of_row, _) = 2 * HALF + 1, part.stride()
+        shape = len(part), side, side, rows.stop - rows.start, width
+        strides = of_layer, SPACING * of_row, SPACING, of_row, 1
+        around = part.as_strided(shape, strides, part.storage_offset())[:, down, right]
+        votes, weights, colours = (
+            around[0 : len(layers) : 2],
+            around[1 : len(layers) : 2],
+            around[len(layers) :],
+        )
+        alike = (colours - left[:, None, rows]).abs_().mean(0).div_(-BRIGHTNESS).exp_() * of_window
+        own = shift[rows][None]
+        votes = torch.cat([own, votes.flatten(0, 1)])
+        weights = torch.cat([weight_of_map.expand_as(own), (weights * alike).flatten(0, 1)])
+        out[rows] = _mean_near_median(votes, weights)
     return out
 
 

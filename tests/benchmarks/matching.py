@@ -25,7 +25,7 @@ from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.build import build_cost_volume, inverse_pose_preferred, pilot_volume, to_grid
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import match_volume
-from geodiff_plugin.matching.sweep import CostVolume, median_shift, sweep_planes
+from geodiff_plugin.matching.sweep import CostVolume, sweep_planes
 from geodiff_plugin.types import CameraView
 
 __all__ = [
@@ -147,7 +147,7 @@ def measure(pair: Pair, device: str = "cpu", repeats: int = 3) -> tuple[dict[str
 
 def disparities_of(volume: CostVolume, width: int) -> int:
     """As many whole pixels of the image as the planes span for the median pixel, a multiple of 16."""
-    near = float(median_shift(volume.rays[0], volume.inverse_depth[-1:])) * width / volume.size[1]
+    near = volume.parallax[0].median_shift(float(volume.inverse_depth[-1])) * width / volume.size[1]
     return 16 * math.ceil(min(near, width / 2) / 16) if math.isfinite(near) else 128
 
 

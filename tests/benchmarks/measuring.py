@@ -24,7 +24,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from geodiff_plugin.runtime.machine import PeakMemory, timed
 
-__all__ = ["Cost", "Traced", "costs", "stage_milliseconds", "traced", "waits_by_place"]
+__all__ = ["Cost", "Traced", "costs", "holders", "stage_milliseconds", "traced", "waits_by_place"]
 
 Call = Callable[[], object]
 #: Parts of the names under which CUPTI records that the host launches work, and that it waits for it.
@@ -134,7 +134,7 @@ def waits_by_place(call: Call) -> Counter[str]:
     return Counter(f"{'/'.join(one.filename.split('/')[-2:])}:{one.lineno}" for one in waits)
 
 
-def _holders(name: str) -> Iterator[tuple[Any, str, Any]]:
+def holders(name: str) -> Iterator[tuple[Any, str, Any]]:
     """Where the package holds a function, or a method as ``Class.method``: owner, attribute, function."""
     modules = [m for key, m in list(sys.modules.items()) if key.partition(".")[0] == "geodiff_plugin"]
     classes = {
@@ -186,7 +186,7 @@ def stage_milliseconds(
         Label -> milliseconds, one of each call; ``None`` for a stage that the package does not have.
     """
     spent: dict[str, list[float]] = {}
-    places = {name: list(_holders(name)) for name in stages}
+    places = {name: list(holders(name)) for name in stages}
     places |= {label: [(owner, m, getattr(owner, m))] for label, (owner, m) in networks.items()}
     with ExitStack() as stack:
         for label, holders in places.items():

@@ -1,0 +1,97 @@
+"""Which planes a sweep needs: how far pixels move in a right view as their depth changes.
+
+Cameras are few numbers, so all of this is NumPy on the CPU in float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from geodiff_plugin._checks import bad_value
+from geodiff_plugin.geometry import NEAREST_M
+from geodiff_plugin.types import CameraView
+
+#: Pixels of the grid that stand for all of it, at least: enough for medians.
+SAMPLES = 1024
+#: A smaller shift cannot be measured, pixels.
+LEAST_SHIFT_PX = 0.3
+#: Decimal exponents of the inverse depths in 1/m between which a shift is sought, and the halvings of their
+#: distance, which reach 0.05 %.
+NEVER_SHIFTED, FULLY_SHIFTED, HALVINGS = -8.0, 5.0, 16
+
+
+def _matrix(matrix: Tensor) -> np.ndarray:
+    return matrix.detach().cpu().numpy().astype(np.float64)
+
+
+class Parallax:
+    """How far left pixels lie, in one right view, from where they would be at infinity."""
+
+    def __init__(
+        self, K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor, size: tuple[int, int], name: str
+    ) -> None:
+        """For the left grid ``size (H, W)``; ``K (3, 3)`` and ``T (4, 4)`` on any device; ``name`` of the pose."""
+        K, K_r, T = (_matrix(each) for each in (K_left, K_right, T_right_from_left))
+        pixels = size[0] * size[1]
+        row, column = np.divmod(np.arange(0, pixels, max(1, pixels // SAMPLES)), size[1])
+        y = (row - K[1, 2]) / K[1, 1]
+        x = (column - K[0, 2]) / K[0, 0] - K[0, 1] / K[0, 0] * y
+        infinity = K_r @ T[:3, :3] @ np.stack([x, y, np.ones_like(x)])
+        #: The left camera's centre, a homogeneous right pixel, (3, 1).
+        self.centre: np.ndarray = K_r @ T[:3, 3:]
+        self._infinity, self._name = infinity[:, infinity[2] > NEAREST_M], name
+        self._uv = self._infinity[:2] / self._infinity[2]
+
+    def median_shift(self, inverse_depth: float) -> float:
+        """Pixels by which the median pixel moves from infinity to a plane, 1/m.
+
+        A rotation, which moves all depths alike, does not count. Infinite where the plane passes behind the
+        right camera. ``InputError`` where no pixel's point at infinity is in front of that camera.
+        """
+        if not self._infinity.size:
+            expected, got = "a pose under which the views overlap", "a right camera that looks the other way"
+            bad_value(self._name, expected, got)
+        p = self._infinity + inverse_depth * self.centre  # the line in z, divided by z
+        in_front = p[2] > NEAREST_M
+        shift = np.hypot(*(p[:2] / np.where(in_front, p[2], 1.0) - self._uv))
+        middle = (len(shift) - 1) // 2
+        return float(np.partition(np.where(in_front, shift, np.inf), middle)[middle])
+
+    def inverse_depth_at(self, shift_px: float) -> float:
+        """The inverse depth, 1/m within 1 %, at which ``median_shift`` reaches ``shift_px`` > 0.
+
+        If one camera stands behind the other, pixels move to the epipole at most, so ``shift_px`` is bounded
+        by half of that way. ``InputError`` where both cameras stand at one place.
+        """
+        low, high = NEVER_SHIFTED, FULLY_SHIFTED
+        most = self.median_shift(10.0**high)
+        if most < LEAST_SHIFT_PX:
+            bad_value(self._name, "a pose with a baseline", "both cameras at one place")
+        shift_px = min(shift_px, 0.5 * most)
+        for _ in range(HALVINGS):  # the shift grows with inverse depth
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if self.median_shift(10.0**middle) >= shift_px else (middle, high)
+        return 10.0**high
+
+
+def parallax_of(rights: Sequence[CameraView], K_left: Tensor, size: tuple[int, int]) -> tuple[Parallax, ...]:
+    """The ``Parallax`` of every right view on the left grid ``(H, W)``."""
+    names = ["E"] if len(rights) == 1 else [f"E of right view {v}" for v in range(1, len(rights) + 1)]
+    return tuple(Parallax(K_left, K, T, size, name) for (_, K, T), name in zip(rights, names, strict=True))
+
+
+def even_planes(
+    views: Sequence[Parallax], span: tuple[float, float], step_px: float, least: int, most: int
+) -> Tensor:
+    """Inverse depths ``(D,)`` float32 over ``span``; from one to the next the median pixel moves by a step.
+
+    There are ``least`` to ``most`` of them.
+    """
+    first, last = span
+    moved = max(view.median_shift(last) - view.median_shift(first) for view in views)
+    wanted = round(moved / step_px) + 1 if np.isfinite(moved) else most  # not finite behind a camera
+    return torch.from_numpy(np.linspace(first, last, min(max(wanted, least), most), dtype=np.float32))

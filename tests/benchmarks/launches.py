@@ -1,0 +1,209 @@
+"""Torch operations and kernel launches of a guided call on the code path of CUDA, counted without a card.
+
+    python -m tests.benchmarks.launches
+
+Data flow: the demo pair, a narrow Marigold with random weights -> operations of every stage, networks apart.
+
+On a GPU the host sends one operation after the other, and where they are small their number is the time.
+Stages run as on CUDA, but a kernel's launch is counted and not made; what such a stage returns is its
+reference's result, which is not counted. The host's own operations on cameras are counted as well: they take
+as long. Views, which launch nothing, are shown apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from diffusers.utils import logging as diffusers_logging
+from torch.utils._python_dispatch import TorchDispatchMode
+from triton.runtime.jit import KernelInterface
+
+from geodiff_plugin import _kernels
+from geodiff_plugin.bundled.demo_pair import read_demo_pair
+from geodiff_plugin.cli.terminal import new_table, show
+from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from tests.benchmarks.measuring import holders
+from tests.benchmarks.random_marigold import random_marigold
+
+__all__ = ["Counted", "count_guided_call"]
+
+#: Functions that choose between a kernel and its reference: pure functions of tensors.
+WITH_KERNELS = ("sweep_planes", "match_volume", "solve_field", "refine_to_matches")
+#: Functions, and methods as ``Class.method``, whose operations are shown apart; each without those below it.
+STAGES = (
+    "clean",
+    "refine_views",
+    "build_cost_volume",
+    "pilot_volume",
+    "sweep_planes",
+    "match_volume",
+    "inverse_pose_preferred",
+    "reliable_matches",
+    "Trajectory.settle_scale",
+    "search_scale",
+    "fit_to_points",
+    "refine_to_matches",
+    "reject_reflections",
+    "prior_error",
+    "correction_target",
+    "fit_depth",
+    "solve_field",
+    "finish",
+    "sharpen_edges",
+    "vote_depth",
+    "reprojection",
+    "depth_confidence",
+    "measure_indicators",
+    "stack_results",
+)
+#: What belongs to no stage: the host's loop, resizing, and the hooks of the call.
+ELSEWHERE = "elsewhere"
+
+
+@dataclass
+class Counted:
+    """What a call did, by stage.
+
+    Attributes:
+        operations: torch operations, views among them.
+        views: operations that only describe a tensor anew.
+        launches: of Triton kernels.
+    """
+
+    operations: Counter[str] = field(default_factory=Counter)
+    views: Counter[str] = field(default_factory=Counter)
+    launches: Counter[str] = field(default_factory=Counter)
+
+
+class _Counting(TorchDispatchMode):
+    """Counts the operations of this thread into the stage that runs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counted, self.stages, self._off = Counted(), [ELSEWHERE], 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if not self._off:
+            self.counted.operations[self.stages[-1]] += 1
+            self.counted.views[self.stages[-1]] += func.is_view
+        made = func(*args, **kwargs or {})
+        # What no kernel fills must be no index out of bounds.
+        return made.zero_() if "empty" in func.name() else made
+
+    @contextmanager
+    def off(self) -> Iterator[None]:
+        """Count nothing within the block."""
+        self._off += 1
+        try:
+            yield
+        finally:
+            self._off -= 1
+
+    def uncounted(self, own: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, with nothing of it counted."""
+
+        @functools.wraps(own)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            with self.off():
+                return own(*args, **kwargs)
+
+        return call
+
+    def within(self, stage: str, own: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, as a stage."""
+
+        @functools.wraps(own)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            self.stages.append(stage)
+            try:
+                return own(*args, **kwargs)
+            finally:
+                self.stages.pop()
+
+        return call
+
+    def by_reference(self, own: Callable[..., Any]) -> Callable[..., Any]:
+        """The function counted with its kernels, whose launches change nothing; its reference's result."""
+
+        @functools.wraps(own)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if not self._off:
+                own(*args, **kwargs)
+            with self.off(), _kernels.without_kernels():
+                return own(*args, **kwargs)
+
+        return call
+
+    def launch(self, kernel: Any, grid: Any) -> Callable[..., None]:
+        """In place of ``kernel[grid]``."""
+
+        def counted(*args: Any, **kwargs: Any) -> None:
+            if not self._off:
+                self.counted.launches[self.stages[-1]] += 1
+
+        return counted
+
+
+@contextmanager
+def _as_on_cuda(counting: _Counting, pipe: Any) -> Iterator[None]:
+    """Stages take the way that they take on CUDA, and are counted."""
+    with ExitStack() as stack:
+
+        def put(owner: Any, name: str, value: Any) -> None:
+            stack.enter_context(patch.object(owner, name, value))
+
+        put(_kernels, "interpreting", lambda: True)
+        put(KernelInterface, "__getitem__", lambda kernel, grid: counting.launch(kernel, grid))
+        for name in WITH_KERNELS:
+            for owner, attribute, own in list(holders(name)):
+                put(owner, attribute, counting.by_reference(own))
+        for name in STAGES:
+            for owner, attribute, own in list(holders(name)):
+                put(owner, attribute, counting.within(name, own))
+        for network, method in ((pipe.unet, "forward"), (pipe.vae, "encode"), (pipe.vae, "decode")):
+            put(network, method, counting.uncounted(getattr(network, method)))
+        stack.enter_context(counting)
+        yield
+
+
+def count_guided_call(resolution: int = 768) -> Counted:
+    """Operations and launches of one guided call of the demo pair, without its networks.
+
+    Args:
+        resolution: longer side of what the prior works on, pixels.
+    """
+    pipe = enable_geometry_guidance(random_marigold(width=0.01))
+    pipe.set_progress_bar_config(disable=True)
+    pair, counting = read_demo_pair(), _Counting()
+    options = {"processing_resolution": resolution, "num_inference_steps": 4}
+    guidance = GeometryGuidance(pair.right, (pair.rig.K_left, pair.rig.K_right), pair.rig.E)
+    with _as_on_cuda(counting, pipe):
+        pipe(pair.left, guidance=guidance, generator=torch.Generator("cpu").manual_seed(0), **options)
+    return counting.counted
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--resolution", type=int, default=768, help="longer side of the map, pixels")
+    diffusers_logging.set_verbosity_error()
+    found = count_guided_call(parser.parse_args().resolution)
+    table = new_table(("stage", "operations", "of them views", "Triton launches"))
+    for stage in (*STAGES, ELSEWHERE):
+        table.add_row(stage, *(str(each[stage]) for each in (found.operations, found.views, found.launches)))
+    totals = (each.total() for each in (found.operations, found.views, found.launches))
+    table.add_row("in all", *map(str, totals))
+    show(table)
+
+
+if __name__ == "__main__":
+    main()
