@@ -311,11 +311,14 @@ def _conjugate_gradients(system: FieldSystem, start: Tensor | None, steps: int, 
     return x
 
 
+def _of_batch(part: Tensor, pull: Tensor) -> Tensor:
+    """A part of a system, contiguous, with as many samples as ``pull``."""
+    return (part if len(part) == len(pull) else part.expand(len(pull), -1, -1, -1)).contiguous()
+
+
 def solve_field(system: FieldSystem, steps: int, start: Tensor | None) -> Tensor:
     """``solver.solve_field`` by kernels: the same steps on the same grids."""
-    batch = system.pull.shape[0]
-    parts = {name: part.expand(batch, -1, -1, -1).contiguous() for name, part in vars(system).items()}
-    levels = [FieldSystem(**parts)]
+    levels = [FieldSystem(*(_of_batch(part, system.pull) for part in vars(system).values()))]
     while start is None and min(levels[-1].weight.shape[-2:]) > solver.COARSEST_SIDE:
         levels.append(_coarser(levels[-1]))
     arrivals = torch.zeros(len(levels), ALIGNED, dtype=torch.int32, device=system.pull.device)

@@ -7,11 +7,13 @@ de-noising"); the quantisation table is K.1 of ITU-T T.81.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._kernels import launch_bound
 from geodiff_plugin.geometry import to_device_of
 from geodiff_plugin.matching.census import grey
 
@@ -63,10 +65,10 @@ _SHRUNK = 6.0
 
 def _basis(like: Tensor) -> Tensor:
     """Orthonormal DCT-II, ``(frequency, pixel)``."""
-    n = torch.arange(_BLOCK, device=like.device, dtype=like.dtype)
+    n = torch.arange(_BLOCK, device="cpu", dtype=like.dtype)
     waves = torch.cos(math.pi * (2 * n[None] + 1) * n[:, None] / (2 * _BLOCK)) * math.sqrt(2 / _BLOCK)
     waves[0] /= math.sqrt(2)
-    return waves
+    return to_device_of(like, waves)
 
 
 def _to_blocks(levels: Tensor, basis: Tensor) -> Tensor:
@@ -96,15 +98,14 @@ def _jpeg_scale(levels: Tensor, basis: Tensor) -> float:
     """The largest steps of which the coefficients of a picture are multiples; its blocks begin at (0, 0)."""
     blocks = _to_blocks(levels, basis).reshape(-1, _BLOCK, _BLOCK)
     blocks = blocks[:: math.ceil(len(blocks) / _MOST_BLOCKS)]
-    value = torch.stack([blocks[:, row, column] for row, column in _KEPT], 1).abs()[..., None]
+    places = torch.tensor([_BLOCK * row + column for row, column in _KEPT], device="cpu")
+    value = blocks.flatten(1)[:, to_device_of(blocks, places)].abs()[..., None]
     step = torch.arange(2, _MOST_STEP, device=levels.device, dtype=levels.dtype)
     counts = value > 0.6 * step  # 0 is a multiple of everything
     number = counts.sum(0)
     fit = (torch.cos(2 * math.pi * value / step) * counts).sum(0) / number.clamp_min(1)
     largest = (step * ((fit > _LEAST_FIT) & (number >= _LEAST_VALUES))).amax(-1).cpu()
-    table = _table(largest)
-    of_table = torch.stack([table[row, column] for row, column in _KEPT])
-    scales = [scale for scale in (largest / of_table).tolist() if scale > 0]
+    scales = [scale for scale in (largest / _table(largest).flatten()[places]).tolist() if scale > 0]
     if len(scales) < _LEAST_VOTES:
         return 0.0
     middle = sorted(scales)[(len(scales) - 1) // 2]
@@ -125,7 +126,11 @@ def find_flaws(image_01: Tensor) -> tuple[float, float]:
     80; 0 where no trace of compression remains, as after resampling. A device is waited for twice.
     """
     levels = grey(image_01)[0] * 255.0
-    basis = _basis(levels)
+    return _flaws(levels, _basis(levels))
+
+
+def _flaws(levels: Tensor, basis: Tensor) -> tuple[float, float]:
+    """``find_flaws`` of grey levels ``(H, W)``."""
     edges = [_first_edge(levels, axis).to(levels) for axis in (0, 1)]
     top, left, energy = torch.stack([*edges, _noise_energy(levels, basis)]).tolist()
     scale = _jpeg_scale(levels[int(top) :, int(left) :], basis)
@@ -154,16 +159,38 @@ def clean(image_01: Tensor, grid_pixels: int) -> Tensor:
     if image_01.shape[-2] * image_01.shape[-1] > _SHRUNK * grid_pixels:
         return image_01
     levels = grey(image_01)[0] * 255.0
-    basis, threshold = _basis(levels), _threshold(*find_flaws(image_01), levels)
+    basis = _basis(levels)
+    threshold = _threshold(*_flaws(levels, basis), levels)
     if threshold is None:
         return image_01
-    height, width = levels.shape
-    sides = _BLOCK, _BLOCK + (-width) % _BLOCK, _BLOCK, _BLOCK + (-height) % _BLOCK
+    tall, broad = (side + (-side) % _BLOCK + _BLOCK for side in levels.shape)  # whole blocks, and one more
+    sides = _BLOCK, broad - levels.shape[1], _BLOCK, tall - levels.shape[0]
     wide = F.pad(levels[None, None], sides, mode="reflect")[0, 0]
-    total = torch.zeros_like(levels)
-    for row, column in _SHIFTS:
-        blocks = _to_blocks(wide[row:, column:], basis)
-        kept = (blocks * (blocks.abs() >= threshold)).transpose(1, 2)
-        kept = _transformed(kept, basis.T).flatten(2, 3).flatten(0, 1)
-        total += kept[_BLOCK - row :, _BLOCK - column :][:height, :width]
+    if launch_bound(levels):  # all at once
+        moved = to_device_of(levels, torch.tensor(_SHIFTS, device="cpu").T)
+        total = _thresholded(wide, levels.shape, *moved, basis, threshold).sum(0)
+    else:
+        total = torch.zeros_like(levels)
+        for shift in _SHIFTS:
+            total += _thresholded(wide, levels.shape, *shift, basis, threshold)
     return (image_01 + (total / len(_SHIFTS) - levels) / 255.0).clamp(0.0, 1.0)
+
+
+def _thresholded(
+    wide: Tensor, size: tuple[int, ...], down: Any, across: Any, basis: Tensor, threshold: Tensor
+) -> Tensor:
+    """A picture of ``size (H, W)`` without its small coefficients, in blocks that begin at (down, across).
+
+    ``wide`` is the picture with a block more on every side, and whole blocks. Indices ``(n,)`` give ``(n, H,
+    W)``.
+    """
+    tall, broad = (side - _BLOCK for side in wide.shape)
+    windows = wide.as_strided((_BLOCK, _BLOCK, tall, broad), (*wide.stride(), *wide.stride()))
+    blocks = windows[down, across].reshape(-1, _BLOCK, broad // _BLOCK, _BLOCK)
+    coefficients = _transformed(blocks, basis)
+    kept = coefficients * (coefficients.abs() >= threshold[:, None])
+    kept = _transformed(kept, basis.T).view(-1, tall, broad)
+    strides = tall * broad, broad, 1, broad, 1
+    back = kept.as_strided((len(kept), _BLOCK + 1, _BLOCK + 1, *size), strides)
+    which = 0 if isinstance(down, int) else torch.arange(len(kept), device=wide.device)
+    return back[which, _BLOCK - down, _BLOCK - across]

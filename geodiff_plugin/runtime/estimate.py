@@ -41,10 +41,14 @@ KNOWN: dict[tuple[Any, ...], str] = {
 
 @dataclass(frozen=True)
 class ProcessingGrid:
-    """The grid that a pipeline denoises on: ``(H, W)`` of the image, and rows and columns of padding."""
+    """The grid that a pipeline denoises on: ``(H, W)`` of the image, and rows and columns of padding.
+
+    ``image (N, 3, H, W)`` is the preprocessed image of the call, with its padding.
+    """
 
     content: tuple[int, int]
     padding: tuple[int, int]
+    image: Tensor
 
     @property
     def size(self) -> tuple[int, int]:

@@ -65,8 +65,11 @@ def networks_of(pipe: Any) -> list[torch.nn.Module]:
     return [m for m in pipe.components.values() if isinstance(m, torch.nn.Module)]
 
 
-def images_in_float32(processor: Any) -> AbstractContextManager[None]:
-    """Let an image processor work in float32: float16 cannot hold the white of a 16-bit image, 65535."""
+def images_in_float32(processor: Any, known: tuple[Any, Any] = (None, None)) -> AbstractContextManager[None]:
+    """Let an image processor work in float32: float16 cannot hold the white of a 16-bit image, 65535.
+
+    ``known`` are an image and its ``preprocess`` already, with the arguments of the call.
+    """
     stock = processor.preprocess
 
     def preprocess(
@@ -76,7 +79,8 @@ def images_in_float32(processor: Any) -> AbstractContextManager[None]:
         device: torch.device | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> Any:
-        images, *rest = stock(image, processing_resolution, resample_method_input, device, torch.float32)
+        arguments = image, processing_resolution, resample_method_input, device, torch.float32
+        images, *rest = known[1] if image is known[0] else stock(*arguments)
         return images.to(dtype), *rest
 
     return replaced(processor, "preprocess", preprocess)

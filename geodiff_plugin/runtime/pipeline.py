@@ -128,15 +128,15 @@ class GuidedCall(_Stock):
             call |= _one_member(call)
         device = self._execution_device
         lefts_01 = lefts_01.to(device)
-        codec = MapCodec(self, prior, self._processing_grid(lefts_01, call, device), tiny)
+        # Channels last, as the stock call reads pictures; with given latents Marigold does not accept it.
+        layout = torch.channels_last if call["latents"] is None else torch.contiguous_format
+        call["image"] = lefts_01.contiguous(memory_format=layout)
+        codec = MapCodec(self, prior, self._processing_grid(call, device), tiny)
         guidance.check_left_images(lefts_01)
         evidence = Beside(lambda: _prepared(guidance, lefts_01), device)
         try:
             if prior.takes_prompt and call.get("prompt_depth") is None:
                 call["prompt_depth"] = depth_prompt(evidence.result(), guidance.config)
-            # Channels last, as the stock call reads pictures; with given latents Marigold does not accept it.
-            layout = torch.channels_last if call["latents"] is None else torch.contiguous_format
-            call["image"] = lefts_01.contiguous(memory_format=layout)
             run = GuidedRun(codec, guidance, evidence.result, call, rounds, unlocked)
             stock = self._run_stock(run, call)
         finally:
@@ -153,13 +153,13 @@ class GuidedCall(_Stock):
         finally:
             run.release()
 
-    def _processing_grid(self, image: Any, call: dict[str, Any], device: torch.device) -> ProcessingGrid:
-        """The grid that the stock call will denoise on, from the stock preprocessing."""
+    def _processing_grid(self, call: dict[str, Any], device: torch.device) -> ProcessingGrid:
+        """The grid that the stock call will denoise on, by the stock preprocessing, which is done once."""
         resolution = call["processing_resolution"]
         resolution = self.default_processing_resolution if resolution is None else resolution
         preprocess = self.image_processor.preprocess
-        padded, padding, _ = preprocess(image, resolution, call["resample_method_input"], device)
-        return ProcessingGrid((padded.shape[-2] - padding[0], padded.shape[-1] - padding[1]), padding)
+        image, padding, _ = preprocess(call["image"], resolution, call["resample_method_input"], device)
+        return ProcessingGrid((image.shape[-2] - padding[0], image.shape[-1] - padding[1]), padding, image)
 
     def progress_bar(self, iterable: Any = None, total: int | None = None, **kwargs: Any) -> Any:
         """Stock progress bars; while guided they are off, because the run shows one bar for all."""

@@ -31,6 +31,7 @@ from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from tests.benchmarks.cost import resized_pair
 from tests.benchmarks.measuring import holders
 from tests.benchmarks.random_marigold import random_marigold
 
@@ -175,19 +176,23 @@ def _as_on_cuda(counting: _Counting, pipe: Any) -> Iterator[None]:
         yield
 
 
-def count_guided_call(resolution: int = 768) -> Counted:
+def count_guided_call(resolution: int = 768, side: int | None = None) -> Counted:
     """Operations and launches of one guided call of the demo pair, without its networks.
 
     Args:
         resolution: longer side of what the prior works on, pixels.
+        side: longer side of the photographs, pixels; ``None`` for the demo pair's own.
     """
     pipe = enable_geometry_guidance(random_marigold(width=0.01))
     pipe.set_progress_bar_config(disable=True)
     pair, counting = read_demo_pair(), _Counting()
+    left, right, cameras = pair.left, pair.right, (pair.rig.K_left, pair.rig.K_right)
+    if side is not None:
+        left, right, cameras = resized_pair(pair, side)
     options = {"processing_resolution": resolution, "num_inference_steps": 4}
-    guidance = GeometryGuidance(pair.right, (pair.rig.K_left, pair.rig.K_right), pair.rig.E)
+    guidance = GeometryGuidance(right, cameras, pair.rig.E)
     with _as_on_cuda(counting, pipe):
-        pipe(pair.left, guidance=guidance, generator=torch.Generator("cpu").manual_seed(0), **options)
+        pipe(left, guidance=guidance, generator=torch.Generator("cpu").manual_seed(0), **options)
     return counting.counted
 
 

@@ -189,7 +189,7 @@ def stage_milliseconds(
     places = {name: list(holders(name)) for name in stages}
     places |= {label: [(owner, m, getattr(owner, m))] for label, (owner, m) in networks.items()}
     with ExitStack() as stack:
-        for label, holders in places.items():
-            stack.enter_context(_clocked(holders, label, device, spent))
+        for label, found in places.items():
+            stack.enter_context(_clocked(found, label, device, spent))
         call()
-    return {label: spent.get(label, []) if holders else None for label, holders in places.items()}
+    return {label: spent.get(label, []) if found else None for label, found in places.items()}
