@@ -98,13 +98,14 @@ def constant_like(like: Tensor, *values: float) -> Tensor:
     return torch.stack([like.new_full((), value) for value in values])
 
 
-def to_device_of(like: Tensor, matrix: Tensor) -> Tensor:
+def to_device_of(like: Tensor, matrix: Tensor | np.ndarray) -> Tensor:
     """A camera matrix, or positions made of cameras, on the device of ``like``, in its own dtype.
 
     Cameras stay on the CPU, where decisions about them are taken, until they meet pixels. The host does not
     wait: a copy of so few bytes from its memory is staged at once.
     """
-    return matrix.to(like.device, non_blocking=True)
+    given = torch.from_numpy(np.ascontiguousarray(matrix)) if isinstance(matrix, np.ndarray) else matrix
+    return given.to(like.device, non_blocking=True)
 
 
 def unproject(depth_m: Tensor, K: Tensor) -> Tensor:

@@ -6,8 +6,8 @@ Collins 1996, "A space-sweep approach to true multi-image matching".
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,8 +25,6 @@ _PHASES = 8
 _ROW_PHASES = 4
 # Plain shifts may drift across the rows by this much: calibrated baselines lie a little out of the row.
 _MOST_DRIFT_PX = 1.0
-# Given wherever a tensor is made: otherwise the user's default device and dtype would apply.
-_CPU_FLOAT64: dict[str, Any] = {"device": "cpu", "dtype": torch.float64}
 
 
 @dataclass(frozen=True)
@@ -36,46 +34,42 @@ class AlignedView:
     A left pixel ``(u, v)`` on plane k lies at ``scale[k] * (u, v) + shift[k]`` of the canvas, so warping by a
     plane, either way, looks up rows and columns. ``grey (h, w)``; ``valid (h, w)`` bool, inside the right
     image, ``None`` for all of the canvas; ``scale (D,)``, 0 behind the right camera, and ``shift (D, 2)``,
-    column and row, are float64 on the CPU.
+    column and row, are float64.
     """
 
     grey: Tensor
     valid: Tensor | None
-    scale: Tensor
-    shift: Tensor
+    scale: np.ndarray
+    shift: np.ndarray
 
     @property
     def size(self) -> tuple[int, int]:
         """``(h, w)`` of the canvas."""
         return self.grey.shape[0], self.grey.shape[1]
 
-    def positions(self, count: int, axis: int, margin: int = 0) -> Tensor:
+    def positions(self, count: int, axis: int, margin: int = 0) -> np.ndarray:
         """Where the left grid's ``count`` columns (``axis`` 0) or rows (1) lie, ``(D, count + 2 * margin)``.
 
-        Canvas pixels, float32 on the CPU, not clipped; the lines beyond the grid repeat its outermost.
+        Canvas pixels, float32, not clipped; the lines beyond the grid repeat its outermost.
         """
-        lines = torch.arange(-margin, count + margin, **_CPU_FLOAT64).clamp_(0, count - 1)
-        return (self.scale[:, None] * lines + self.shift[:, axis, None]).float()
+        lines = np.arange(-margin, count + margin).clip(0, count - 1)
+        return (self.scale[:, None] * lines + self.shift[:, axis, None]).astype(np.float32)
 
-    def sources(self, count: int, axis: int) -> Tensor:
-        """The inverse of ``positions``: the left line of each canvas line, ``(D, n)``; ``count`` for none.
-
-        They are int64 on the CPU.
-        """
-        lines = torch.arange(self.size[1 - axis], **_CPU_FLOAT64)
-        scale = self.scale[:, None]
-        at = ((lines - self.shift[:, axis, None]) / scale.clamp_min(1e-9)).round()
+    def sources(self, count: int, axis: int) -> np.ndarray:
+        """The inverse of ``positions``: the left line of each canvas line, ``(D, n)``; ``count`` for none."""
+        lines, scale = np.arange(self.size[1 - axis]), self.scale[:, None]
+        at = ((lines - self.shift[:, axis, None]) / np.maximum(scale, 1e-9)).round()
         seen = (scale > 0) & (at >= 0) & (at < count)
-        return torch.where(seen, at, float(count)).long()
+        return np.where(seen, at, count).astype(np.int64)
 
-    def inside(self, positions: Tensor, axis: int) -> Tensor:
+    def inside(self, positions: np.ndarray, axis: int) -> np.ndarray:
         """Which of the ``positions`` are on the canvas, and not behind the right camera; ``(D, n)`` bool."""
         last = self.size[1 - axis] - 1
         return (positions >= -EDGE_PX) & (positions <= last + EDGE_PX) & (self.scale > 0)[:, None]
 
-    def nearest(self, positions: Tensor, axis: int) -> Tensor:
+    def nearest(self, positions: np.ndarray, axis: int) -> np.ndarray:
         """The canvas lines nearest to ``positions``, ``(D, n)`` int64; those outside are its outermost."""
-        return positions.round().clamp_(0, self.size[1 - axis] - 1).long()
+        return positions.round().clip(0, self.size[1 - axis] - 1).astype(np.int64)
 
 
 def align_view(
@@ -87,14 +81,14 @@ def align_view(
     planes. The canvas covers the part of the right image on them, at most three left grids wide and high.
     """
     image, *matrices = right
-    K_r, T, K = (matrix.detach().cpu().double() for matrix in (*matrices, K_left))
-    R, w = T[:3, :3], inverse_depth.cpu().double()
+    K_r, T, K = (each.detach().cpu().numpy().astype(np.float64) for each in (*matrices, K_left))
+    R, w = T[:3, :3], inverse_depth.cpu().numpy().astype(np.float64)
     centre = R.T @ T[:3, 3]
     ratio = 1.0 + w * centre[2]  # depth in the turned view over depth in the left view
-    scale = torch.where(ratio > _LEAST_RATIO, 1.0 / ratio.clamp_min(_LEAST_RATIO), torch.zeros_like(ratio))
+    scale = np.where(ratio > _LEAST_RATIO, 1.0 / np.maximum(ratio, _LEAST_RATIO), 0.0)
     moved = w[:, None] * (K[:2, :2] @ centre[:2]) - K[:2, 2]
     shift = scale[:, None] * moved + K[:2, 2]
-    to_right = K_r @ R @ torch.linalg.inv(K)  # of a left pixel's point at infinity
+    to_right = K_r @ R @ np.linalg.inv(K)  # of a left pixel's point at infinity
     offset = _translation(to_right, size)
     if offset is not None:
         return AlignedView(image[0], None, scale, shift + offset)
@@ -102,10 +96,10 @@ def align_view(
     return AlignedView(*_turned(image, to_right, low, high), scale, shift - low)
 
 
-def _turned(image: Tensor, to_right: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+def _turned(image: Tensor, to_right: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[Tensor, Tensor]:
     """A right image under a homography, from column and row ``low`` to ``high``, and its valid pixels."""
     # Not every device has float64; on CUDA the CPU would be waited for.
-    device = image.device if image.is_cuda else low.device
+    device = image.device if image.is_cuda else torch.device("cpu")
     columns, rows = (
         torch.arange(int(a), int(b) + 1, dtype=torch.float64, device=device)
         for a, b in zip(low, high, strict=True)
@@ -120,34 +114,40 @@ def _turned(image: Tensor, to_right: Tensor, low: Tensor, high: Tensor) -> tuple
     return turned, valid.to(image.device)
 
 
-def _translation(to_right: Tensor, size: tuple[int, int]) -> Tensor | None:
+def _translation(to_right: np.ndarray, size: tuple[int, int]) -> np.ndarray | None:
     """The shift ``(2,)`` that a homography equals on the left grid; ``None`` if it is no plain shift."""
     height, width = size
     ends = [[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]]
-    corners = torch.tensor(ends, **_CPU_FLOAT64)
+    corners = np.array(ends, dtype=np.float64)
     p = corners @ to_right.T
+    if not (p[:, 2] > 0).all():
+        return None
     moved = p[:, :2] / p[:, 2:] - corners[:, :2]
-    close = (p[:, 2] > 0).all() and (moved - moved.mean(0)).abs().amax() < _AS_IT_IS_PX
-    return moved.mean(0) if close else None
+    mean = moved.mean(0)
+    return mean if np.abs(moved - mean).max() < _AS_IT_IS_PX else None
 
 
 def _extent(
-    to_right: Tensor, size: tuple[int, int], size_right: tuple[int, int], scale: Tensor, shift: Tensor
-) -> tuple[Tensor, Tensor]:
+    to_right: np.ndarray,
+    size: tuple[int, int],
+    size_right: tuple[int, int],
+    scale: np.ndarray,
+    shift: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """First and last column and row ``(2,)`` of the canvas, in pixels of the left grid at infinity."""
-    far = torch.tensor([size[1] - 1.0, size[0] - 1.0], **_CPU_FLOAT64)
-    ends = torch.stack([shift, shift + scale[:, None] * far])[:, scale > 0].flatten(0, 1)
-    low, high = (ends.amin(0), ends.amax(0)) if len(ends) else (torch.zeros_like(far), far)
-    low, high = torch.maximum(low, -far), torch.minimum(high, 2 * far)
-    steps = torch.linspace(0, 1, 9, **_CPU_FLOAT64)
-    u, v = steps * (size_right[1] - 1), steps * (size_right[0] - 1)
-    grid = torch.stack(torch.meshgrid(u, v, indexing="ij"), -1).flatten(0, 1)
-    back = torch.nn.functional.pad(grid, (0, 1), value=1.0) @ torch.linalg.inv(to_right).T
-    if (back[:, 2] > 0.1 * back[:, 2].abs().amax()).all():  # else the image reaches to the horizon
+    far = np.array([size[1] - 1.0, size[0] - 1.0])
+    ends = np.concatenate([shift, shift + scale[:, None] * far])[np.tile(scale > 0, 2)]
+    low, high = (ends.min(0), ends.max(0)) if len(ends) else (np.zeros_like(far), far)
+    low, high = np.maximum(low, -far), np.minimum(high, 2 * far)
+    steps = np.linspace(0, 1, 9)
+    u, v = np.meshgrid(steps * (size_right[1] - 1), steps * (size_right[0] - 1))
+    grid = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1)
+    back = grid @ np.linalg.inv(to_right).T
+    if (back[:, 2] > 0.1 * np.abs(back[:, 2]).max()).all():  # else the image reaches to the horizon
         seen = back[:, :2] / back[:, 2:]
-        low, high = torch.maximum(low, seen.amin(0)), torch.minimum(high, seen.amax(0))
-    low = low.floor()
-    return low, torch.maximum(high.ceil(), low + 1)
+        low, high = np.maximum(low, seen.min(0)), np.minimum(high, seen.max(0))
+    low = np.floor(low)
+    return low, np.maximum(np.ceil(high), low + 1)
 
 
 def _resampled(grey: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
@@ -181,28 +181,35 @@ class EvenShifts:
         """The column at which the plane begins in the image of its phase."""
         return self.columns[plane] // _PHASES - self.first
 
-    def lines(self, phase: tuple[int, int], height: int) -> tuple[Tensor, Tensor]:
+    def lines(self, phase: tuple[int, int], height: int) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the canvas, with a margin, that make the image of a phase; float32."""
         column, row = phase
-        # Integers would be promoted to the user's default dtype.
-        dtype, device = torch.float32, "cpu"
-        rows = torch.arange(-MARGIN_PX, height + MARGIN_PX, dtype=dtype, device=device)
-        columns = torch.arange(-MARGIN_PX, self.count + MARGIN_PX, dtype=dtype, device=device)
-        return rows.clamp_(0, height - 1) + row / _ROW_PHASES, columns + (self.first + column / _PHASES)
+        rows = np.arange(-MARGIN_PX, height + MARGIN_PX, dtype=np.float32).clip(0, height - 1)
+        columns = np.arange(-MARGIN_PX, self.count + MARGIN_PX, dtype=np.float32)
+        return rows + np.float32(row / _ROW_PHASES), columns + np.float32(self.first + column / _PHASES)
 
 
 def even_shifts(view: AlignedView, width: int) -> EvenShifts | None:
     """The shifts of a view's planes, for a left grid of this width; ``None`` if some plane is no shift."""
     scale, shift = view.scale, view.shift
-    drift = float(shift[:, 1].amax() - shift[:, 1].amin())
-    uneven = drift > _MOST_DRIFT_PX or float((scale - 1.0).abs().amax()) * width > 1.0 / _PHASES
+    drift = np.ptp(shift[:, 1])
+    uneven = drift > _MOST_DRIFT_PX or np.abs(scale - 1.0).max() * width > 1.0 / _PHASES
     if uneven or len(scale) < 4 * _PHASES:
         return None
     # A plane shifted further than the left width beyond the canvas shows only the repeated edge.
-    columns = (shift[:, 0].clamp(-width, view.size[1]) * _PHASES).round().long().tolist()
+    columns = (shift[:, 0].clip(-width, view.size[1]) * _PHASES).round().astype(int).tolist()
     first = min(columns) // _PHASES
-    rows = (shift[:, 1] * _ROW_PHASES).round().long().tolist()
+    rows = (shift[:, 1] * _ROW_PHASES).round().astype(int).tolist()
     return EvenShifts(columns, rows, first, max(columns) // _PHASES - first + width)
+
+
+def _nearest_lines(
+    view: AlignedView, columns: np.ndarray, rows: np.ndarray, like: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The canvas rows and columns nearest to positions with a margin, ``(D, H)`` and ``(D, W)``."""
+    inner = slice(MARGIN_PX, -MARGIN_PX)
+    lines = view.nearest(rows[:, inner], 1), view.nearest(columns[:, inner], 0)
+    return to_device_of(like, lines[0]), to_device_of(like, lines[1])
 
 
 class ComparedView:
@@ -216,6 +223,7 @@ class ComparedView:
         self._columns_inside = to_device_of(left, view.inside(columns[:, inner], 0))
         self._rows_inside = to_device_of(left, view.inside(rows[:, inner], 1))
         self._columns, self._rows = to_device_of(left, columns), to_device_of(left, rows)
+        self._nearest = None if view.valid is None else _nearest_lines(view, columns, rows, left)
         self._shifts = even_shifts(view, width)
         self._left = left if self._shifts is None else left.to(torch.int8)
         self._work = torch.empty_like(self._left)
@@ -241,10 +249,8 @@ class ComparedView:
     def seen(self, plane: int) -> Tensor:
         """``(H, W)`` bool: what the right view sees of a plane."""
         seen = self._rows_inside[plane][:, None] & self._columns_inside[plane]
-        if self._view.valid is None:
+        if self._view.valid is None or self._nearest is None:
             return seen
-        inner = slice(MARGIN_PX, -MARGIN_PX)
-        rows = self._view.nearest(self._rows[plane, inner], 1)
-        columns = self._view.nearest(self._columns[plane, inner], 0)
+        rows, columns = (each[plane] for each in self._nearest)
         valid = self._view.valid.index_select(0, rows)
         return seen & valid.gather(1, columns.expand(len(rows), -1))

@@ -167,12 +167,12 @@ def clean(image_01: Tensor, grid_pixels: int) -> Tensor:
     sides = _BLOCK, broad - levels.shape[1], _BLOCK, tall - levels.shape[0]
     wide = F.pad(levels[None, None], sides, mode="reflect")[0, 0]
     if launch_bound(levels):  # all at once
-        moved = to_device_of(levels, torch.tensor(_SHIFTS, device="cpu").T)
-        total = _thresholded(wide, levels.shape, *moved, basis, threshold).sum(0)
+        down, across = to_device_of(levels, torch.tensor(_SHIFTS, device="cpu").T)
+        total = _thresholded(wide, levels.shape, down, across, basis, threshold).sum(0)
     else:
         total = torch.zeros_like(levels)
-        for shift in _SHIFTS:
-            total += _thresholded(wide, levels.shape, *shift, basis, threshold)
+        for row, column in _SHIFTS:
+            total += _thresholded(wide, levels.shape, row, column, basis, threshold)
     return (image_01 + (total / len(_SHIFTS) - levels) / 255.0).clamp(0.0, 1.0)
 
 

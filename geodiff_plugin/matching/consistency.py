@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -64,16 +65,16 @@ def _right_winners(volume: CostVolume, view: AlignedView, buffers: Buffers) -> T
     return _positions(aggregate(levels, view.grey[::_EVERY_ROW], buffers=buffers))
 
 
-def _looked_up(levels: Tensor, rows: Tensor, columns: Tensor, buffers: Buffers) -> Tensor:
+def _looked_up(levels: Tensor, rows: np.ndarray, columns: np.ndarray, buffers: Buffers) -> Tensor:
     """The costs ``(D, h, w)`` at the ``sources`` of another view; ``UNSEEN_LEVEL`` where it has none."""
     planes, height, width = levels.shape
-    rows, columns = to_device_of(levels, rows), to_device_of(levels, columns)
+    row, column = to_device_of(levels, rows), to_device_of(levels, columns)
     # The extra row and column are read by pixels of the other view that the left image does not show.
     plane = torch.full((height + 1, width + 1), UNSEEN_LEVEL, dtype=torch.float32, device=levels.device)
     found = buffers.empty("levels", planes, (rows.shape[1], columns.shape[1]), levels)
     for k, of_plane in enumerate(levels):
         plane[:height, :width] = of_plane
-        found[k] = plane.index_select(0, rows[k]).index_select(1, columns[k])
+        found[k] = plane.index_select(0, row[k]).index_select(1, column[k])
     return found
 
 
@@ -83,7 +84,7 @@ def _disagreement(view: AlignedView, other: Tensor, position: Tensor) -> Tensor:
     ``other`` are the right view's ``_right_winners``, ``position (H, W)`` those of the left view.
     """
     device = position.device
-    scale, shift = (to_device_of(position, each.float()) for each in (view.scale, view.shift))
+    scale, shift = (to_device_of(position, each.astype(np.float32)) for each in (view.scale, view.shift))
     below = position.floor().long().clamp(0, len(scale) - 2)
     part = position - below
     at_scale = torch.lerp(scale[below], scale[below + 1], part)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 import triton
 import triton.language as tl
@@ -309,13 +310,13 @@ def _right_levels(view: AlignedView, size: tuple[int, int], planes: range) -> tu
     else:
         phases = sorted({shifts.phase(plane) for plane in planes})
         lines = [shifts.lines(phase, size[0]) for phase in phases]
-        rows, columns = (torch.stack(each) for each in zip(*lines, strict=True))
+        rows, columns = (np.stack(each) for each in zip(*lines, strict=True))
         images = [phases.index(shifts.phase(plane)) for plane in planes]
         begins = [shifts.begin(plane) for plane in planes]
     area = rows.shape[1] * columns.shape[1]
     starts = [area * image + begin for image, begin in zip(images, begins, strict=True)]
     levels = _resampled(view.grey, *(to_device_of(view.grey, each) for each in (rows, columns)))
-    return levels, to_device_of(view.grey, torch.tensor(starts, dtype=torch.int32, device="cpu"))
+    return levels, to_device_of(view.grey, np.array(starts, dtype=np.int32))
 
 
 def _resampled(grey: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
@@ -335,14 +336,12 @@ def seen(view: AlignedView, size: tuple[int, int]) -> Tensor:
     """``alignment.ComparedView.seen`` of all planes, ``(D, H, W)`` bool."""
     lines = view.positions(size[0], 1), view.positions(size[1], 0)
     rows, columns = (
-        to_device_of(view.grey, view.inside(at, axis).T.contiguous())
-        for at, axis in zip(lines, (1, 0), strict=True)
+        to_device_of(view.grey, view.inside(at, axis).T) for at, axis in zip(lines, (1, 0), strict=True)
     )
     found = rows[:, None] & columns
     if view.valid is not None:
         row, column = (
-            to_device_of(view.grey, view.nearest(at, axis).T.contiguous())
-            for at, axis in zip(lines, (1, 0), strict=True)
+            to_device_of(view.grey, view.nearest(at, axis).T) for at, axis in zip(lines, (1, 0), strict=True)
         )
         found &= view.valid[row[:, None], column]
     return found.permute(2, 0, 1)
@@ -377,12 +376,12 @@ def look_up_kernel(
     tl.store(found + pixel.to(tl.int64) * planes + plane, cost, mask=used)
 
 
-def looked_up(levels: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+def looked_up(levels: Tensor, rows: np.ndarray, columns: np.ndarray) -> Tensor:
     """``consistency._looked_up`` of costs ``(D, H, W)`` at ``AlignedView.sources``."""
     planes, *size = levels.shape
     height, width = rows.shape[1], columns.shape[1]
     found = torch.empty(height, width, planes, dtype=levels.dtype, device=levels.device)
-    at = (to_device_of(levels, each.T.int().contiguous()) for each in (rows, columns))
+    at = (to_device_of(levels, each.T.astype(np.int32)) for each in (rows, columns))
     grid = triton.cdiv(height * width, COST_BLOCK[0]), triton.cdiv(planes, COST_BLOCK[1])
     look_up_kernel[grid](
         levels,

@@ -94,4 +94,5 @@ def even_planes(
     first, last = span
     moved = max(view.median_shift(last) - view.median_shift(first) for view in views)
     wanted = round(moved / step_px) + 1 if np.isfinite(moved) else most  # not finite behind a camera
-    return torch.from_numpy(np.linspace(first, last, min(max(wanted, least), most), dtype=np.float32))
+    steps = torch.linspace(0.0, 1.0, min(max(wanted, least), most), dtype=torch.float32, device="cpu")
+    return first + (last - first) * steps

@@ -132,6 +132,16 @@ class _Counting(TorchDispatchMode):
 
         return call
 
+    def copied(self, own: Callable[..., Any]) -> Callable[..., Any]:
+        """A function that copies from the host to the device: one operation, where both are one."""
+
+        @functools.wraps(own)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            self.counted.operations[self.stages[-1]] += not self._off
+            return own(*args, **kwargs)
+
+        return call
+
     def by_reference(self, own: Callable[..., Any]) -> Callable[..., Any]:
         """The function counted with its kernels, whose launches change nothing; its reference's result."""
 
@@ -167,6 +177,8 @@ def _as_on_cuda(counting: _Counting, pipe: Any) -> Iterator[None]:
         for name in WITH_KERNELS:
             for owner, attribute, own in list(holders(name)):
                 put(owner, attribute, counting.by_reference(own))
+        for owner, attribute, own in list(holders("to_device_of")):
+            put(owner, attribute, counting.copied(own))
         for name in STAGES:
             for owner, attribute, own in list(holders(name)):
                 put(owner, attribute, counting.within(name, own))
@@ -188,9 +200,9 @@ def count_guided_call(resolution: int = 768, side: int | None = None) -> Counted
     pair, counting = read_demo_pair(), _Counting()
     left, right, cameras = pair.left, pair.right, (pair.rig.K_left, pair.rig.K_right)
     if side is not None:
-        left, right, cameras = resized_pair(pair, side)
+        left, right, (*cameras,) = resized_pair(pair, side)
     options = {"processing_resolution": resolution, "num_inference_steps": 4}
-    guidance = GeometryGuidance(right, cameras, pair.rig.E)
+    guidance = GeometryGuidance(right, tuple(cameras), pair.rig.E)
     with _as_on_cuda(counting, pipe):
         pipe(left, guidance=guidance, generator=torch.Generator("cpu").manual_seed(0), **options)
     return counting.counted
