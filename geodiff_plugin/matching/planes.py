@@ -34,7 +34,7 @@ class Parallax:
     def __init__(
         self, K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor, size: tuple[int, int], name: str
     ) -> None:
-        """For the left grid ``size (H, W)``; ``K (3, 3)`` and ``T (4, 4)`` on any device; ``name`` of the pose."""
+        """Of the left grid ``size (H, W)``; ``K (3, 3)``, ``T (4, 4)`` on any device; errors say ``name``."""
         K, K_r, T = (_matrix(each) for each in (K_left, K_right, T_right_from_left))
         pixels = size[0] * size[1]
         row, column = np.divmod(np.arange(0, pixels, max(1, pixels // SAMPLES)), size[1])

@@ -48,7 +48,7 @@ class ProcessingGrid:
 
     content: tuple[int, int]
     padding: tuple[int, int]
-    image: Tensor
+    image: Tensor | None = None
 
     @property
     def size(self) -> tuple[int, int]:
