@@ -45,7 +45,8 @@ class Capture:
     >>> out = capture.depth(pipe, "frame_0010")
 
     ``frames`` are in order, with ``names``; ``kind`` is their layout, ``unit`` ``"m"``, or ``None`` where no
-    length is known; ``notes`` are for the user; ``solved`` is the result of ``solve``.
+    length is known; ``notes`` are for the user; ``solved`` is the result of ``solve``; ``metres_per_unit`` is
+    by what ``rescale`` has multiplied the lengths that the capture came with.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class Capture:
         self.names = [frame.name for frame in frames]
         if len(set(self.names)) < len(self.names):  # one would be taken for the other
             bad_value("the frames", "of different names", ", ".join(self.names))
+        self.metres_per_unit = 1.0
         self.solved: SolvedCapture | None = None
         self._way: str | None = None  # how it was solved
         self._video: VideoReader | None = None
@@ -142,6 +144,7 @@ class Capture:
             points = None if frame.points is None else frame.points * factor
             frames.append(replace(frame, E=None if frame.E is None else frame.E * longer, points=points))
         self.frames, self.unit = frames, "m"
+        self.metres_per_unit *= factor
         if solved is not None:
             given = None if solved.E_given is None else solved.E_given * longer
             self.solved = replace(solved, E=solved.E * longer, E_given=given, points=solved.points * factor)

@@ -15,10 +15,12 @@ from geodiff_plugin import plotting
 from geodiff_plugin._checks import InputFileError, warn
 from geodiff_plugin.capture.agreement import agreed, scene_poses, steadied
 from geodiff_plugin.capture.frames import Capture, choose_neighbours
+from geodiff_plugin.capture.splats import SplatFrame, write_splats
 from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb, write_vertices
 from geodiff_plugin.formats.colmap import write_colmap
 from geodiff_plugin.formats.depth import write_depth_mm, write_depth_npy
-from geodiff_plugin.formats.out import atomic_path, write_text
+from geodiff_plugin.formats.out import REPORT, atomic_path, files_of_report, write_text
+from geodiff_plugin.formats.transforms import TRANSFORMS, transforms_of
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.multiview import Observations
 from geodiff_plugin.types import DepthFrame
@@ -26,6 +28,8 @@ from geodiff_plugin.types import DepthFrame
 #: Depth and confidence of a frame by its own run, which agreement starts from whenever it is made anew.
 ALONE = ("depth_alone", "confidence_alone")
 AGREED = ("depth", "confidence", "confirmed", "asked")
+#: Pictures of the depth that agreement makes anew.
+FIGURES = ("depth_mm.png", "depth.png")
 #: Frames that a frame is checked against, frames on the contact sheet, points of the GLB.
 OTHERS, ON_SHEET, GLB_POINTS = 6, 24, 400_000
 #: Pixels of the video, whose frames are a photograph and its depth side by side, and frames a second.
@@ -98,6 +102,15 @@ def save_alone(folder: Path, depth: np.ndarray, confidence: np.ndarray | None) -
             np.save(temporary, values.astype(np.float32))
 
 
+def clear_frame(folder: Path) -> None:
+    """Remove what a run wrote of a frame; files of others stay, and then the folder."""
+    names = [*(f"{file}.npy" for file in (*ALONE, *AGREED)), *FIGURES, *files_of_report(folder), REPORT]
+    for path in (folder / name for name in names):
+        path.unlink(missing_ok=True)
+    if not any(folder.iterdir()):
+        folder.rmdir()
+
+
 def _alone(folder: Path, K: np.ndarray, _: str | None) -> DepthFrame:
     """Depth and confidence by the frame's own run, saved as ``ALONE`` on first use."""
     if not (folder / f"{ALONE[1]}.npy").is_file():
@@ -108,9 +121,17 @@ def _alone(folder: Path, K: np.ndarray, _: str | None) -> DepthFrame:
 
 
 def write_results(
-    capture: Capture, out: Path, names: Sequence[str], export: Sequence[str], doubted: Sequence[str]
+    capture: Capture,
+    out: Path,
+    names: Sequence[str],
+    export: Sequence[str],
+    doubted: Sequence[str],
+    source: Path,
 ) -> dict[str, Any]:
-    """Write, after ``write_agreement``, clouds, a sheet that marks ``doubted`` frames, ``export``; counts."""
+    """Write, after ``write_agreement``, clouds, a sheet that marks ``doubted`` frames, ``export``; counts.
+
+    ``source`` is the path of the capture.
+    """
     unsure = set(doubted) if len(doubted) < len(names) else set()  # of these only what another frame confirms
 
     def load(name: str) -> DepthFrame:
@@ -128,9 +149,16 @@ def write_results(
         solved = capture.solve()
         seen = [solved.seen[capture.names.index(name)] for name in names]
         write_workspace(out / "colmap", map(load, names), capture.image, solved.points, seen)
+    if "nerfstudio" in export:
+        original = transforms_of(source) if capture.kind == TRANSFORMS else None
+        write_splats(out / "nerfstudio", capture, names, lambda name: _sure(load(name)), cloud, original)
     _sheet(capture, out, names, doubted)
     _video(capture, out, names)
     return {"cloud_points": count}
+
+
+def _sure(frame: DepthFrame) -> SplatFrame:
+    return SplatFrame(frame, kept(frame))
 
 
 def _sheet(capture: Capture, out: Path, names: Sequence[str], doubted: Sequence[str]) -> None:

@@ -14,7 +14,9 @@ import typer.main
 from typer.core import TyperGroup
 
 from geodiff_plugin._checks import InputError, bad_value
-from geodiff_plugin.cli.terminal import EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from geodiff_plugin.cli.terminal import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED
+from geodiff_plugin.jobs.memory import CURE, is_out_of_memory
+from geodiff_plugin.jobs.stopping import Terminated, ending_on_sigterm
 from geodiff_plugin.jobs.telling import say
 from geodiff_plugin.options import CAMERAS, OUTPUT, RUN, Command, check_options, flag_of
 
@@ -37,17 +39,26 @@ class _Group(TyperGroup):
 
 
 class _OutermostGroup(_Group):
-    """Bad input is one line and exit code 2, Ctrl-C is exit code 130."""
+    """Bad input is one line and exit code 2, Ctrl-C is exit code 130, SIGTERM 143."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen subcommand."""
         try:
-            return super().invoke(ctx)
+            with ending_on_sigterm():
+                return super().invoke(ctx)
+        except Terminated:
+            say("geodiff: terminated; the same command resumes")
+            sys.exit(EXIT_TERMINATED)
         except KeyboardInterrupt:
             say("geodiff: interrupted; the same command resumes")
             sys.exit(EXIT_INTERRUPTED)
         except InputError as error:  # any other is a defect, and keeps its traceback
             say(f"geodiff: {error}")
+            sys.exit(EXIT_BAD_INPUT)
+        except Exception as error:
+            if not is_out_of_memory(error):
+                raise
+            say(f"geodiff: the memory is not enough. {CURE}.")
             sys.exit(EXIT_BAD_INPUT)
 
 

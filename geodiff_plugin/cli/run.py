@@ -119,6 +119,7 @@ def summary(report: dict[str, Any], out: Path) -> str:
         line += f", median depth {depths[len(depths) // 2]:.2f} {unit}"
     if doubted := report["not_trusted"]:
         line += f"; NOT TRUSTED: {', '.join(doubted[:MOST_NAMES])}{' ...' if doubted[MOST_NAMES:] else ''}"
-        reasons = next(f["verdict"]["reasons"] for f in report["frames"] if f["frame"] == doubted[0])
+        judged = (frame for frame in report["frames"] if "verdict" in frame)  # those that failed are not
+        reasons = next(frame["verdict"]["reasons"] for frame in judged if frame["frame"] == doubted[0])
         line += f" ({doubted[0]}: {' '.join(reasons[:1]) or UNTESTED})"
     return f"{line} -> {out}/"

@@ -10,7 +10,7 @@ if TYPE_CHECKING:  # drawn by few commands
     from rich.console import RenderableType
     from rich.table import Table
 
-EXIT_BAD_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED = 2, 4, 130
+EXIT_BAD_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 4, 130, 143
 #: Characters a line may have where nobody's terminal bounds it.
 UNBOUNDED = 10_000
 

@@ -117,6 +117,10 @@ class Images:
         self._used = set[str]()
         self._searched = ", ".join("its folder" if at == "." else at for at in places) or "any folder"
 
+    def file(self, name: str) -> Path | None:
+        """The image of a name, if there is one."""
+        return self._files[name]
+
     def candidate(self, name: str, build: Callable[[CaptureFrame], Candidate]) -> Candidate:
         """The candidate that ``build`` makes of a frame with its name and file, if there is one."""
         file, twice = self._files[name], name in self._used

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin._signals import keeping_sigterm
 from geodiff_plugin.formats.rigs import COEFFICIENT_COUNTS, COLMAP_LENSES
 from geodiff_plugin.types import Distortion
 
@@ -45,7 +46,8 @@ def undistorted(image_01: np.ndarray, K: np.ndarray, distortion: Distortion) -> 
 
 def _colmap_camera(K: np.ndarray, distortion: Distortion) -> Any:
     """The camera as pycolmap has it, whose first pixel's centre lies at (0.5, 0.5)."""
-    import pycolmap
+    with keeping_sigterm():
+        import pycolmap
 
     camera = pycolmap.Camera.create_from_model_name(1, distortion.model, 1.0, 1, 1)
     focals = (K[0, 0], K[1, 1])[: len(camera.focal_length_idxs())]

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import NoReturn, Self, TypeVar
+from typing import IO, NoReturn, Self, TypeVar
 
 from geodiff_plugin._checks import InputFileError, MissingFileError, bad_value
 
@@ -22,6 +22,8 @@ except ImportError:  # Windows: two runs with one folder are not detected
     fcntl = None  # type: ignore[assignment]
 
 PARTIAL, LOCK, FILES = ".geodiff-partial", "lock", "files"
+#: The lock of a folder that a run works in for long, in full view of other runs.
+FOLDER_LOCK = ".geodiff-lock"
 REPORT = "report.json"
 LEAST_FREE_BYTES = 8 << 20
 
@@ -88,7 +90,8 @@ def check_out(path: Path) -> Path:
 
 def _holds_files(target: Path) -> bool:
     """Whether a folder is there and has more in it than what an unfinished run left."""
-    return target.is_dir() and any(path.name != PARTIAL for path in target.iterdir())
+    left = (PARTIAL, FOLDER_LOCK)
+    return target.is_dir() and any(path.name not in left for path in target.iterdir())
 
 
 def check_new(path: Path, overwrite: bool) -> Path:
@@ -117,17 +120,49 @@ def free_folder(default: Path) -> Path:
     return path
 
 
-def _take(hidden: Path, stack: ExitStack) -> bool:
-    """Lock a hidden folder until ``stack`` is closed, or the process ends; ``False`` where another has it."""
-    file = stack.enter_context(open(hidden / LOCK, "ab"))
+def lock_file(file: IO[bytes], shared: bool = False) -> bool:
+    """Lock an open file until it is closed or the process ends, alone or with others that share it.
+
+    ``False`` where another has it. Windows and file systems without locks notice nobody.
+    """
     if not fcntl:
         return True
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
+    except OSError:
+        return True
+    return True
+
+
+@contextmanager
+def working_in(folder: Path, *, shared: bool = False) -> Iterator[None]:
+    """Have a folder alone, or with others that share it, until the block ends; else ``InputError``."""
+    path = folder / FOLDER_LOCK
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(open(path, "ab"))
+        except OSError as error:
+            unwritable(folder, error)
+        while (taken := lock_file(file, shared)) and os.fstat(file.fileno()).st_nlink == 0:
+            file = stack.enter_context(open(path, "ab"))  # whoever had it has just removed it
+        if not taken:
+            cure = "Wait for it, or name another."
+            bad_value("--out", "a folder that no other run has", f"{folder}, which one is working in", cure)
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # Windows removes no open file
+                if lock_file(file):  # the last of those that shared it
+                    path.unlink()
+
+
+def _take(hidden: Path, stack: ExitStack) -> bool:
+    """Lock a hidden folder until ``stack`` is closed, or the process ends; ``False`` where another has it."""
+    file = stack.enter_context(open(hidden / LOCK, "ab"))
     # A run that ended meanwhile has removed the file: nobody's lock.
-    return os.fstat(file.fileno()).st_nlink > 0
+    return lock_file(file) and os.fstat(file.fileno()).st_nlink > 0
 
 
 def _held(hidden: Path) -> bool:
@@ -136,7 +171,7 @@ def _held(hidden: Path) -> bool:
         return (hidden / LOCK).is_file() and not _take(hidden, stack)
 
 
-def _files_of_report(folder: Path) -> set[str]:
+def files_of_report(folder: Path) -> set[str]:
     """Names of the files that an earlier run wrote there, as its report lists them."""
     try:
         names = json.loads((folder / REPORT).read_text(encoding="utf-8"))["files"]["names"]
@@ -212,7 +247,7 @@ class OutFolder:
         if not self._target.is_dir():
             os.rename(files, self._target)
             return
-        written, earlier = {path.name for path in files.iterdir()}, _files_of_report(self._target)
+        written, earlier = {path.name for path in files.iterdir()}, files_of_report(self._target)
         for name in sorted(written - {REPORT}):
             os.replace(files / name, self._target / name)
         for path in (self._target / name for name in earlier - written):

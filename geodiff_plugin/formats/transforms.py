@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -56,7 +56,22 @@ DISTORTED_FOLDERS = ("resized_images", "original_images")
 #: What files call the map of known depths of a frame.
 DEPTHS = ("depth_file_path", "depth_path")
 DEPTH_SUFFIXES = (".png", ".npy", ".tiff", ".tif", ".exr")
+#: The kind of these captures.
+TRANSFORMS = "transforms.json"
+#: Entries of a frame's camera as they are written: a pinhole in pixels, of OpenCV's model with no distortion.
+NERF_CAMERA = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")
+#: Further entries of cameras and lenses, which those replace.
+OTHERS_OF_CAMERA = ("k3", "k4", "distortion_params", "camera_model", "camera_angle_x", "camera_angle_y")
 Frame = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class TransformsFile:
+    """What a file says beside cameras: ``shared`` of all frames, and of each frame by its image."""
+
+    path: Path
+    shared: dict[str, Any]
+    frames: dict[Path, Frame]
 
 
 def nerf_frames(text: str) -> Iterator[Frame]:
@@ -133,20 +148,56 @@ def read_nerf(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 
 def read_transforms(path: Path) -> Layout | None:
     """The frames that a file names, or the file of a folder; depth maps by name or as ``depth/NAME``."""
-    file = path if path.is_file() else next((path / name for name in FILES if (path / name).is_file()), path)
-    if file.suffix != ".json" or not file.is_file():
+    file = _file_of(path)
+    if file is None:
         return None
-    text = read_text(file, "PATH")
-    if file == path and not ('"frames"' in text and '"file_path"' in text):
-        return None
-    frames = list(nerf_frames(text))
+    frames = list(nerf_frames(read_text(file, "PATH")))
     images = Images([str(frame["file_path"]) for frame in frames], _folders(file), file)
     candidates = [
         images.candidate(name, partial(_build, entries=entries, folder=file.parent))
         for name, entries in zip(images.names, frames, strict=True)
     ]
     solved = any(key in entries for entries in frames for key in OF_COLMAP)
-    return Layout("transforms.json", None if solved else "m", candidates, as_stored=True, notes=_notes(file))
+    return Layout(TRANSFORMS, None if solved else "m", candidates, as_stored=True, notes=_notes(file))
+
+
+def _file_of(path: Path) -> Path | None:
+    """The file that is, or lies in, a path; ``None`` where there is none of these."""
+    file = path if path.is_file() else next((path / name for name in FILES if (path / name).is_file()), path)
+    if file.suffix != ".json" or not file.is_file():
+        return None
+    text = read_text(file, "PATH")
+    return None if file == path and not ('"frames"' in text and '"file_path"' in text) else file
+
+
+def transforms_of(path: Path) -> TransformsFile | None:
+    """The entries of the file that ``read_transforms`` reads; ``None`` for another capture."""
+    file = _file_of(path)
+    if file is None:
+        return None
+    data = json.loads(read_text(file, "PATH"))
+    frames = [frame for frame in data["frames"] if "file_path" in frame]
+    images = Images([str(frame["file_path"]) for frame in frames], _folders(file), file)
+    of_image: dict[Path, Frame] = {}
+    for name, frame in zip(images.names, frames, strict=True):
+        if (image := images.file(name)) is not None:
+            of_image.setdefault(image, frame)
+    shared = {k: v for k, v in data.items() if k not in ("frames", *NERF_CAMERA, *OTHERS_OF_CAMERA)}
+    without = ("file_path", *OTHERS_OF_CAMERA)
+    of_image = {
+        image: {"file_path": frame["file_path"]} | {k: v for k, v in frame.items() if k not in without}
+        for image, frame in of_image.items()
+    }
+    return TransformsFile(file, shared, of_image)
+
+
+def named_in_transforms(file: TransformsFile | None, name: Any) -> Path | None:
+    """A file that an entry names, if it lies at or below the folder of the ``transforms.json``."""
+    if file is None or not isinstance(name, str):
+        return None
+    folder = file.path.parent.resolve()
+    path = (folder / name.replace("\\", "/")).resolve()
+    return path if path.is_relative_to(folder) and path.is_file() else None
 
 
 def _folders(file: Path) -> list[Path]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import multiprocessing
+import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,12 +25,15 @@ from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.capture.results import ALONE, save_alone, write_agreement, write_results
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
-from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, check_new, write_text
-from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard, fingerprint, shards_beside
+from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, check_new, working_in, write_text
+from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Record, Shard, shards_beside
+from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import OF_SCALE, CaptureOptions
 from geodiff_plugin.jobs.prior import load_guided_prior
-from geodiff_plugin.jobs.report import messages_of, plain, single_map, verdict_report
+from geodiff_plugin.jobs.provenance import RECORD, SUMMARY, Provenance, begin_frames, check_poses
+from geodiff_plugin.jobs.report import messages_of, plain, read_report, single_map, verdict_report
 from geodiff_plugin.jobs.runner import Runner
+from geodiff_plugin.jobs.stopping import ending_with_parent
 from geodiff_plugin.jobs.telling import Tell, collected_warnings, say, silent
 from geodiff_plugin.jobs.writing import write_maps
 from geodiff_plugin.messages import Message, as_records
@@ -38,18 +42,19 @@ from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.types import MetricDepthOutput
 
 POSES_FILE, JOURNAL = "poses.npz", "frames.jsonl"
-#: What the poses depend on, and beside them the depth of a frame.
-OF_POSES = ("poses", "k", "fov", "trajectory")
-OF_FRAME = ("neighbours", "points", *OF_SCALE, "prior", "prior_map", "space", "steps", "seed")
 #: Memory that one process of the bundled prior takes at 640x480, bytes; what a larger prior takes is unknown.
 PROCESS_BYTES = 1.5e9
-Record = dict[str, Any]
+#: What helps too where the memory is not enough.
+FEWER_PROCESSES = ", or give a lower --processes"
 
 
-def _key(capture: Capture, options: CaptureOptions, *of: str) -> str:
-    """A digest of the settings ``of`` and the frames that a result depends on."""
-    said = {name: str(getattr(options, name)) for name in of}
-    return fingerprint(said, __version__, capture.names, str(options.path.resolve()))
+@dataclass(frozen=True)
+class RunKeys:
+    """What a helping process needs beside the options: keys of poses and frames, metres per unit."""
+
+    poses_key: str
+    frames_key: str
+    factor: float | None
 
 
 def open_capture(options: CaptureOptions) -> Capture:
@@ -65,16 +70,19 @@ def open_capture(options: CaptureOptions) -> Capture:
     return capture
 
 
-def solved_poses(capture: Capture, options: CaptureOptions, factor: float | None = None) -> float | None:
+def solved_poses(
+    capture: Capture, options: CaptureOptions, key: str, factor: float | None = None
+) -> float | None:
     """Solve for the poses, or load those of an earlier run of the same capture; then set the scale.
 
-    Returns metres per unit of the poses; ``factor`` passes in what another process found.
+    ``key`` is that of what the poses depend on. Returns metres per unit of the poses; ``factor`` passes in
+    what another process found.
     """
-    path, key = options.out / POSES_FILE, _key(capture, options, *OF_POSES)
-    shard = Shard.of(options.shard)
+    path, shard = options.out / POSES_FILE, Shard.of(options.shard)
     solved = None if options.overwrite and shard.whole else load_solved(path, key)
     if solved is None and not shard.whole:
-        refuse("The poses are not solved yet: run geodiff capture with --poses-only first, then the shards.")
+        of = "The poses of these frames are not solved yet"
+        refuse(f"{of}: run geodiff capture with --poses-only first, then the shards.")
     if solved is None:
         solved = capture.solve(options.poses, threads=available_cores())
         _save_solved(path, solved, key)
@@ -173,15 +181,23 @@ def _depth(
         return capture.depth(pipe, name, options.neighbours, seed=options.seed, points=points, **call)
 
 
-def _write_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[], Any], item: Item) -> Record:
+def _make_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[], Any], item: Item) -> Record:
+    """One frame, within the memory that there is."""
+    pipe, size = loaded(), capture.frame(item.key).size
+    with fitting_memory("A frame", size, FEWER_PROCESSES):
+        return _write_frame(capture, options, pipe, item)
+
+
+def _write_frame(capture: Capture, options: CaptureOptions, pipe: Any, item: Item) -> Record:
     """One frame: its files, and its report."""
-    name, pipe, started = item.key, loaded(), time.perf_counter()
+    name, started = item.key, time.perf_counter()
     output = _depth(capture, pipe, name, options, options.points)
     depth, solved, number = single_map(output.prediction), capture.solve(), capture.names.index(name)
     low, middle, high = (float(v) for v in np.percentile(depth, (2, 50, 98)))
     report: Record = {
         "version": __version__,
         "frame": name,
+        "made_from": item.inputs,
         "neighbours": capture.neighbours(name, options.neighbours),
         "unit": output.unit,
         "K": np.asarray(output.K)[0].tolist(),
@@ -198,6 +214,7 @@ def _write_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[],
     def fill(folder: Path) -> None:
         report["files"] = write_maps(folder, output, capture.image(name))
         save_alone(folder, depth, None if output.confidence is None else single_map(output.confidence))
+        report["files"]["names"] = [*sorted(path.name for path in folder.iterdir()), REPORT]
         report["seconds"] = round(time.perf_counter() - started, 2)
         write_text(folder / REPORT, json.dumps(report, indent=2) + "\n")
 
@@ -207,20 +224,19 @@ def _write_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[],
 
 
 def _run_frames(
-    capture: Capture, options: CaptureOptions, names: Sequence[str], factor: float | None, progress: bool
+    capture: Capture, options: CaptureOptions, names: Sequence[str], keys: RunKeys, progress: bool
 ) -> list[Record]:
     """Depth of every chosen frame that is not done yet, by one process a core; their reports in order."""
     path, shard = options.out / JOURNAL, Shard.of(options.shard)
     if options.overwrite:
         for each in (path, *shards_beside(path).values()) if shard.whole else (shard.path(path),):
             each.unlink(missing_ok=True)
-    key = _key(capture, options, *OF_POSES, *OF_FRAME)
-    items = [Item(name, inputs=key) for name in names]
+    items = [Item(name, inputs=keys.frames_key, head={"frame": name}) for name in names]
     if not shard.whole:
         return _work(capture, options, items, shard, progress)
     with Journal(path) as journal:
         count = _processes(options, sum(journal.get(item) is None for item in items))
-        if count > 1 and _in_processes(capture, options, items, factor, count, progress):
+        if count > 1 and _in_processes(capture, options, items, keys, count, progress):
             made = journal.read()
             return [made[item.key, item.inputs] for item in items]
     return _work(capture, options, items, shard, progress)  # all, or what a lost process has left
@@ -230,14 +246,14 @@ def _in_processes(
     capture: Capture,
     options: CaptureOptions,
     items: Sequence[Item],
-    factor: float | None,
+    keys: RunKeys,
     count: int,
     progress: bool,
 ) -> bool:
     """The frames by so many processes, a shard each, of which this is one; whether none was lost."""
     context, more = multiprocessing.get_context("spawn"), list[Any]()
     for index in range(1, count):
-        arguments = options, items, factor, Shard(index, count)
+        arguments = options, items, keys, Shard(index, count)
         more.append(context.Process(target=_help, args=arguments, daemon=True))
         more[-1].start()
     try:
@@ -271,19 +287,29 @@ def _work(
             noun="frame",
             survives=(InputError, OSError, ValueError, RuntimeError),
             progress=progress,
-            whole=lambda item, _: all((options.out / item.key / f"{file}.npy").is_file() for file in ALONE),
+            whole=lambda item, _: _is_made(item, options.out / item.key),
         )
-        return runner.run(partial(_write_frame, capture, options, cache(partial(_pipe, options))))
+        return runner.run(partial(_make_frame, capture, options, cache(partial(_pipe, options))))
 
 
-def _help(options: CaptureOptions, items: list[Item], factor: float | None, shard: Shard) -> None:
+def _is_made(item: Item, folder: Path) -> bool:
+    """Whether a folder holds what this item would make."""
+    whole = all((folder / f"{file}.npy").is_file() for file in ALONE)
+    return whole and read_report(folder).get("made_from") == item.inputs
+
+
+def _help(options: CaptureOptions, items: list[Item], keys: RunKeys, shard: Shard) -> None:
     """Another process of the same run, with a part of its own."""
     options = replace(options, overwrite=False)
-    with collected_warnings(silent):  # the first process has told them
-        capture = open_capture(options)
-        solved_poses(capture, options, factor)
-    with collected_warnings(say):
-        _work(capture, options, items, shard)
+    try:
+        with ending_with_parent():
+            with collected_warnings(silent):  # the first process has told them
+                capture = open_capture(options)
+                solved_poses(capture, options, keys.poses_key, keys.factor)
+            with collected_warnings(say):
+                _work(capture, options, items, shard)
+    except KeyboardInterrupt:  # said by the first process
+        sys.exit(1)
 
 
 def depth_capture(options: CaptureOptions, *, tell: Tell = silent, progress: bool = False) -> Record:
@@ -306,29 +332,61 @@ def depth_capture(options: CaptureOptions, *, tell: Tell = silent, progress: boo
     names = capture.choose(options.frames)
     for note in capture.notes:
         tell(note)
-    ours = any((options.out / name).is_file() for name in (POSES_FILE, JOURNAL))
+    ours = any((options.out / name).is_file() for name in (POSES_FILE, JOURNAL, RECORD))
     check_new(options.out, ours or options.overwrite).mkdir(parents=True, exist_ok=True)
-    factor = solved_poses(capture, options)
-    seconds = {"poses": round(time.perf_counter() - started, 1)}
+    largest = max((capture.frame(name).size for name in names), key=math.prod)
+    with (
+        working_in(options.out, shared=not Shard.of(options.shard).whole),
+        fitting_memory("A capture", largest, FEWER_PROCESSES),
+    ):
+        return _depth_of_frames(capture, options, names, Progress(started, tell, progress))
+
+
+@dataclass(frozen=True)
+class Progress:
+    """When a run began, who hears its lines, and whether it shows a bar."""
+
+    started: float
+    tell: Tell
+    bar: bool
+
+    def seconds(self, *before: float) -> float:
+        """Since the beginning, less those of the stages before."""
+        return round(time.perf_counter() - self.started - sum(before), 1)
+
+
+def _depth_of_frames(
+    capture: Capture, options: CaptureOptions, names: Sequence[str], progress: Progress
+) -> Record:
+    """The run, in a folder that no other one works in."""
+    made_from = Provenance.of(capture, options)
+    poses_key, key = made_from.for_poses().key, made_from.key
+    check_poses(made_from, options.out, options.overwrite)
+    if not options.poses_only:
+        begin_frames(made_from, options.out, names, options.overwrite)
+    factor = solved_poses(capture, options, poses_key)
+    seconds = {"poses": progress.seconds()}
     solved = capture.solve()
-    tell(f"poses {solved.status}: matches lie {solved.residual_px:.2f} px off their epipolar lines")
+    progress.tell(f"poses {solved.status}: matches lie {solved.residual_px:.2f} px off their epipolar lines")
     for note in solved.notes:
         warn(note)
     if options.poses_only:
         return {"unit": capture.unit, "poses": _pose_report(capture)} | _outcome([])
-    frames = _run_frames(capture, options, names, factor, progress)
+    frames = _run_frames(capture, options, names, RunKeys(poses_key, key, factor), progress.bar)
     outcome = _outcome(frames)
     if not Shard.of(options.shard).whole:
         return {"unit": capture.unit} | outcome
-    seconds["frames"] = round(time.perf_counter() - started - seconds["poses"], 1)
+    seconds["frames"] = progress.seconds(*seconds.values())
     done = [name for name in names if name not in outcome["failed"]]
     if not done:
         raise InputError(f"No frame got depth: {frames[0]['error']}")
     agreement = write_agreement(capture, options.out, done)
-    files = write_results(capture, options.out, done, options.export, outcome["not_trusted"])
-    seconds["agreement and cloud"] = round(time.perf_counter() - started - sum(seconds.values()), 1)
+    doubted = outcome["not_trusted"]
+    files = write_results(capture, options.out, done, options.export, doubted, options.path)
+    seconds["agreement and cloud"] = progress.seconds(*seconds.values())
     report = {
         "version": __version__,
+        "made_from": key,
         "path": str(options.path),
         "kind": capture.kind,
         "unit": capture.unit,
@@ -340,7 +398,7 @@ def depth_capture(options: CaptureOptions, *, tell: Tell = silent, progress: boo
         "messages": as_records(capture.notes, solved.notes),
         **outcome,
     }
-    write_text(options.out / "capture.json", json.dumps(report, indent=2) + "\n")
+    write_text(options.out / SUMMARY, json.dumps(report, indent=2) + "\n")
     return report
 
 

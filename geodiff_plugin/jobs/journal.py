@@ -15,12 +15,7 @@ from typing import Any, Self, TypeVar
 
 from geodiff_plugin._checks import bad_value, refuse
 from geodiff_plugin.formats.files import file_digest
-from geodiff_plugin.formats.out import unwritable
-
-try:
-    import fcntl
-except ImportError:  # Windows: two runs with one folder are not noticed
-    fcntl = None  # type: ignore[assignment]
+from geodiff_plugin.formats.out import lock_file, unwritable
 
 Record = dict[str, Any]
 T = TypeVar("T")
@@ -30,7 +25,7 @@ BROKEN = "broken"
 
 
 def fingerprint(*parts: Any) -> str:
-    """20 hexadecimal digits that name inputs: JSON values, and paths, which count by what the file holds."""
+    """20 hexadecimal digits that name inputs: JSON values, arrays, and paths by what their files hold."""
     text = json.dumps([_readable(part) for part in parts], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:20]
 
@@ -43,6 +38,8 @@ def _readable(part: Any) -> Any:
             return None
     if isinstance(part, dict):
         return {name: _readable(value) for name, value in part.items()}
+    if hasattr(part, "tobytes"):  # an array: written out, a long one would be cut
+        return [str(part.dtype), part.shape, hashlib.sha256(part.tobytes()).hexdigest()]
     return [_readable(value) for value in part] if isinstance(part, (list, tuple)) else part
 
 
@@ -119,8 +116,8 @@ class Item:
 class Journal:
     """Records of a job, a line of JSON each; failures of earlier runs do not count.
 
-    Every shard appends to a file of its own and reads those of all, so that no lock is needed. A whole job
-    has its file alone until it is closed: another run with it is refused.
+    Every shard appends to a file of its own and reads those of all, and so does the whole job. A journal has
+    its file alone until it is closed: another run with it is refused.
     """
 
     def __init__(self, path: Path, shard: Shard = Shard()) -> None:
@@ -131,8 +128,7 @@ class Journal:
             self._file = open(self.path, "a+b", buffering=0)
         except OSError as error:
             unwritable(path.parent, error)
-        if shard.whole:
-            self._lock()
+        self._lock()
         self._records = {key: r for key, r in self.read().items() if r.get("status") != BROKEN}
 
     def __enter__(self) -> Self:
@@ -147,17 +143,11 @@ class Journal:
 
     def _lock(self) -> None:
         """Have the file alone until it is closed, or the process ends, however it ends."""
-        if not fcntl:
-            return
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not lock_file(self._file):
             self.close()
             refuse(
                 f"Another run works in {self.path.parent}: wait for it, or give each a --shard of its own."
             )
-        except OSError:  # a file system without locks
-            return
 
     def read(self) -> dict[tuple[str, str], Record]:
         """Every record in the files of all shards by its key and inputs, the last of each that did not fail.

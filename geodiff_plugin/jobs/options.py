@@ -406,8 +406,9 @@ class CaptureOptions(PriorOptions):
     )
     export: tuple[str, ...] = _output(
         (),
-        "Also write colmap (dense workspace) or mesh (TSDF fusion, needs Open3D); repeatable.",
-        choices=("colmap", "mesh"),
+        "Also write nerfstudio (transforms.json with depth, for splats), colmap (dense workspace) or mesh "
+        "(TSDF fusion, needs Open3D); repeatable.",
+        choices=("colmap", "mesh", "nerfstudio"),
     )
     overwrite: bool = _output(
         False, "Write into a folder that holds files, and compute finished frames again."

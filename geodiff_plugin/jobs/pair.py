@@ -10,6 +10,7 @@ import torch
 
 from geodiff_plugin._checks import warn
 from geodiff_plugin.formats.out import REPORT, OutFolder
+from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import DepthOptions, start_pair, with_folder
 from geodiff_plugin.jobs.prior import prior_of_options
 from geodiff_plugin.jobs.reading import PairInputs, read_pair
@@ -48,7 +49,8 @@ def run_pair(
         call["depth_map"] = inputs.prior_map
     pipe.set_progress_bar_config(disable=not progress, file=sys.stderr, leave=False)
     try:
-        with log.stage("guided call"):
+        height, width = inputs.left.shape[:2]
+        with log.stage("guided call"), fitting_memory("A pair", (width, height)):
             output = pipe(inputs.left, guidance=inputs.guidance, strict=options.strict, **call)
             for message in output.warnings:
                 warn(message)
@@ -70,7 +72,9 @@ def write_pair(folder: OutFolder, run: PairRun, **entries: Any) -> PairResult:
     ``entries`` of the report are those that only the caller knows. The folder appears whole or not at all.
     """
     options, inputs, output = run.options, run.inputs, run.output
-    report = build_report(run) | entries
+    height, width = inputs.left.shape[:2]
+    with fitting_memory("The result", (width, height)):
+        report = build_report(run) | entries
 
     def fill(place: Path) -> None:
         with run.log.stage("write"):
@@ -83,7 +87,8 @@ def write_pair(folder: OutFolder, run: PairRun, **entries: Any) -> PairResult:
         report["seconds"] = {stage: round(seconds, 3) for stage, seconds in run.log.seconds.items()}
         (place / REPORT).write_text(report_text(report) + "\n", encoding="utf-8")
 
-    folder.write(fill)
+    with fitting_memory("The result", (width, height)):
+        folder.write(fill)
     return PairResult(run, folder.path, report)
 
 

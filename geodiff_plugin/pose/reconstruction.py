@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin._signals import keeping_sigterm
 from geodiff_plugin.pose.tracks import sift_features
 
 #: Longer side of the images that features are sought in, pixels.
@@ -34,7 +35,8 @@ Match = tuple[int, int, np.ndarray, np.ndarray]
 def pycolmap() -> Any:
     """The package, quiet; ``InputError`` where it is not installed."""
     try:
-        import pycolmap
+        with keeping_sigterm():
+            import pycolmap
     except ImportError:
         cure = "pip install 'geodiff-plugin[capture]', or pip install pycolmap."
         bad_value("pycolmap", "installed to solve for the poses of a capture", "missing", cure)

@@ -99,14 +99,21 @@ def expected_error(
     right camera's centre ``t``; the least over ``poses (4, 4)``. Rotations do not change it. A relative
     error ``scale_spread`` of the poses' length adds to it.
     """
-    rows, columns = np.indices(depth_m.shape)
-    rays = (columns - K_left[0, 2]) / K_left[0, 0], (rows - K_left[1, 2]) / K_left[1, 1]
-    best = np.full(depth_m.shape, np.inf)
-    for E in poses:
-        moved = [K_left[i, i] * (E[i, 3] - rays[i] * E[2, 3]) for i in (0, 1)]  # pixels times metres
-        with np.errstate(divide="ignore"):
-            best = np.minimum(best, (depth_m - E[2, 3]) ** 2 * MATCH_NOISE_PX / np.hypot(*moved))
-    return np.hypot(best, scale_spread * depth_m)
+    height, width = depth_m.shape
+    error_m = np.empty((height, width))
+    ray_x = (np.arange(width) - K_left[0, 2]) / K_left[0, 0]
+    for rows in row_strips(height, width):
+        ray_y = (np.arange(rows.start, rows.stop)[:, None] - K_left[1, 2]) / K_left[1, 1]
+        best = np.full((rows.stop - rows.start, width), np.inf)
+        for E in poses:
+            # pixels times metres
+            moved_x = K_left[0, 0] * (E[0, 3] - ray_x * E[2, 3])
+            moved_y = K_left[1, 1] * (E[1, 3] - ray_y * E[2, 3])
+            with np.errstate(divide="ignore"):
+                error = (depth_m[rows] - E[2, 3]) ** 2 * MATCH_NOISE_PX / np.hypot(moved_x, moved_y)
+            best = np.minimum(best, error)
+        error_m[rows] = np.hypot(best, scale_spread * depth_m[rows])
+    return error_m
 
 
 def reprojection(

@@ -313,9 +313,9 @@ def test_notes_of_saved_poses_keep_their_codes(tmp_path):
 def test_frames_that_are_not_trusted_are_named_and_marked(model, monkeypatch):
     options, write, titles, lowest = model(), run._write_frame, list[str](), list[int]()
 
-    def doubting(capture, options, loaded, item):
+    def doubting(capture, options, pipe, item):
         verdict = {"status": "not trusted" if item.key == "f04" else "trusted", "reasons": ["Blurred."]}
-        return write(capture, options, loaded, item) | {"verdict": verdict}
+        return write(capture, options, pipe, item) | {"verdict": verdict}
 
     def noting(cells, names, **how):
         titles.extend(names)
@@ -359,12 +359,14 @@ def test_a_frame_that_fails_is_named_and_the_rest_is_kept(model, tmp_path, monke
 def test_shards_start_from_poses_that_were_solved_once_and_the_whole_joins_them(model, tmp_path, monkeypatch):
     options, write, written = replace(model(), overwrite=False), run._write_frame, list[str]()
 
-    def noting(capture, options, loaded, item):
+    def noting(capture, options, pipe, item):
         written.append(item.key)
-        return write(capture, options, loaded, item)
+        return write(capture, options, pipe, item)
 
     monkeypatch.setattr(run, "_write_frame", noting)
-    with pytest.raises(InputError, match="poses are not solved yet: run geodiff capture with --poses-only"):
+    with pytest.raises(
+        InputError, match="poses of these frames are not solved yet: run geodiff capture with --poses-only"
+    ):
         run.depth_capture(replace(options, shard="0/2"))
     assert run.depth_capture(replace(options, poses_only=True))["frames"] == [] == written
     monkeypatch.setattr(SOLVE, lambda *_, **__: pytest.fail("solved before"))
@@ -393,7 +395,7 @@ def test_bad_lengths_get_a_sentence(options, words, model, tmp_path):
     with pytest.raises(InputError, match=words):  # all but the last and that of positions before any work
         capture = run.open_capture(model(**options))
         assert words in ("different positions", "without a unit")
-        run.solved_poses(capture, model(**options))
+        run.solved_poses(capture, model(**options), "key")
         capture.known_depths("f01", options["points"])
 
 

@@ -1,0 +1,226 @@
+"""``geodiff capture`` never mixes two runs in one folder, and ends well when it is stopped."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import tracemalloc
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+pytest.importorskip("pycolmap")
+
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.formats.out import FOLDER_LOCK, PARTIAL, working_in
+from geodiff_plugin.jobs.memory import fitting_memory
+from geodiff_plugin.result.confidence import MATCH_NOISE_PX, expected_error
+from tests.cli.conftest import call
+from tests.unit.capture_room import render, walk, write_transforms
+
+TRUE = walk(10)[3:7]
+QUICK = ["--steps", 1, "--neighbours", 1, "--processes", 1, "--device", "cpu", "-q"]
+
+
+@pytest.fixture(autouse=True)
+def few_features(monkeypatch):
+    monkeypatch.setattr("geodiff_plugin.pose.reconstruction.MOST_FEATURES", 450)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A capture, its prior maps, and a folder in which the depth of one frame is finished."""
+    folder = tmp_path_factory.mktemp("finished")
+    write_transforms(folder / "scan", TRUE, TRUE)
+    (folder / "maps").mkdir()
+    for i, E in enumerate(TRUE):
+        np.save(folder / f"maps/f{i:02d}.npy", render(E)[1].astype(np.float32))
+    assert call(typed(folder)) in (0, 4)
+    return folder
+
+
+@pytest.fixture
+def scan(finished, tmp_path):
+    """A copy of it that a test may change."""
+    shutil.copytree(finished, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def typed(folder, *more):
+    maps = ["--prior-map", folder / "maps"]
+    return ["capture", folder / "scan", "--out", folder / "out", *maps, "--frames", "f01", *QUICK, *more]
+
+
+def depth_of(folder):
+    return (folder / "out/f01/depth.npy").read_bytes()
+
+
+def test_the_same_run_again_keeps_what_is_there_also_in_another_place(scan, geodiff):
+    made = (scan / "out/f01/depth_alone.npy").stat().st_mtime_ns
+    answer = geodiff(*typed(scan))
+    assert answer.code in (0, 4), answer.err
+    assert (scan / "out/f01/depth_alone.npy").stat().st_mtime_ns == made
+    assert not (scan / "out" / FOLDER_LOCK).exists()
+
+
+def test_other_settings_are_refused_with_the_difference_and_overwrite_makes_all_anew(scan, geodiff):
+    (scan / "out/f01/notes.txt").write_text("mine")
+    first, summary = depth_of(scan), (scan / "out/capture.json").read_bytes()
+    answer = geodiff(*typed(scan, "--metres-per-unit", 2))
+    assert answer.code == 2 and "made with the default of --metres-per-unit instead of 2.0" in answer.err
+    assert depth_of(scan) == first and (scan / "out/capture.json").read_bytes() == summary
+    assert geodiff(*typed(scan, "--metres-per-unit", 2, "--overwrite")).code in (0, 4)
+    ratio = np.load(scan / "out/f01/depth.npy") / np.load(scan / "maps/f01.npy")
+    assert np.median(ratio) == pytest.approx(2, rel=0.05)
+    assert (scan / "out/f01/notes.txt").read_text() == "mine"
+    answer = geodiff(*typed(scan))
+    assert answer.code == 2 and "made with --metres-per-unit 2.0 instead of the default" in answer.err
+
+
+def changed_camera(folder):
+    path = folder / "scan/transforms.json"
+    said = json.loads(path.read_text())
+    path.write_text(json.dumps(said | {"fl_x": said["fl_x"] * 0.8}))
+
+
+def moved_poses(folder):
+    path = folder / "scan/transforms.json"
+    said = json.loads(path.read_text())
+    for frame in said["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= 3
+    path.write_text(json.dumps(said))
+
+
+def other_image(folder):
+    Image.fromarray(render(TRUE[0])[0][::-1].copy()).save(folder / "scan/images/f02.png")
+
+
+def other_map(folder):
+    np.save(folder / "maps/f01.npy", np.load(folder / "maps/f01.npy") + 1)
+
+
+def lost_frame(folder):
+    (folder / "scan/images/f03.png").unlink()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (changed_camera, "the camera of f00, f01, f02, ... changed"),
+        (moved_poses, "the camera of f00, f01, f02, ... changed"),
+        (other_image, "the image of f02 changed"),
+        (other_map, "the prior map of f01 changed"),
+        (lost_frame, "made of 4 frames instead of 3"),
+    ],
+)
+def test_changed_inputs_are_refused_and_named(change, words, scan, geodiff):
+    first, poses = depth_of(scan), (scan / "out/poses.npz").read_bytes()
+    change(scan)
+    for more in [()] if change is other_map else [(), ("--poses-only",)]:
+        answer = geodiff(*typed(scan, *more))
+        assert answer.code == 2 and words in answer.err and "--overwrite" in answer.err
+    assert depth_of(scan) == first and (scan / "out/poses.npz").read_bytes() == poses
+
+
+def test_a_frame_of_another_run_does_not_count_as_done(scan, geodiff):
+    path = scan / "out/f01/report.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"made_from": "of another"}))
+    answer = geodiff(*typed(scan))
+    assert answer.code == 2 and "f01 has other settings or inputs" in answer.err
+
+
+def test_runs_at_the_same_time_in_one_folder_are_refused_but_shards_share_it(scan, geodiff):
+    whole, shard = typed(scan), typed(scan, "--shard", "0/2")
+    with working_in(scan / "out"):
+        for each in (whole, shard):
+            answer = geodiff(*each)
+            assert answer.code == 2 and "a folder that no other run has" in answer.err
+    with working_in(scan / "out", shared=True):
+        assert geodiff(*whole).code == 2
+        assert geodiff(*shard).code == 0
+    assert not (scan / "out" / FOLDER_LOCK).exists()
+
+
+def test_a_failed_frame_before_an_untrusted_one_is_a_sentence(scan, geodiff):
+    (scan / "maps/f00.npy").unlink()
+    np.save(scan / "maps/f01.npy", 10 - np.load(scan / "maps/f01.npy"))
+    words = [str(word) for word in typed(scan, "--overwrite")]
+    words[words.index("--frames") + 1] = "f00,f01"
+    words.remove("-q")
+    answer = geodiff(*words)
+    assert answer.code == 4, answer.err
+    assert "1 of 2 frames" in answer.out and "NOT TRUSTED: f01 (f01: " in answer.out
+    frames = json.loads((scan / "out/capture.json").read_text())["frames"]
+    assert [frame["frame"] for frame in frames] == ["f00", "f01"] and "f00" in frames[0]["error"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM to be caught")
+def test_asked_to_end_it_clears_away_what_it_began(tmp_path):
+    write_transforms(tmp_path / "scan", TRUE, TRUE)
+    out = tmp_path / "out"
+    words = ["capture", tmp_path / "scan", "--out", out, "--processes", "2", "--device", "cpu", "-q"]
+    shell = [sys.executable, "-m", "geodiff_plugin", *map(str, words)]
+    with subprocess.Popen(shell, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
+        deadline = time.monotonic() + 300
+        while not list(out.glob("f*/" + PARTIAL)) + list(out.glob(f".f*{PARTIAL}")):  # the first is written
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.002)
+        process.send_signal(signal.SIGTERM)
+        _, said = process.communicate(timeout=300)
+    assert process.returncode == 143
+    assert "geodiff: terminated; the same command resumes" in said and "Traceback" not in said
+    left = [path.name for path in out.rglob("*") if PARTIAL in path.name or path.name == FOLDER_LOCK]
+    assert not left
+
+
+TOO_MUCH = [lambda: np.empty(1 << 50), lambda: torch.empty(1 << 50)]
+
+
+@pytest.mark.parametrize("ask", TOO_MUCH, ids=["numpy", "torch"])
+def test_what_does_not_fit_the_memory_is_one_sentence_with_its_size(ask, command, geodiff, monkeypatch):
+    monkeypatch.setattr("geodiff_plugin.jobs.pair.build_report", lambda _: ask())
+    answer = geodiff(*command, "--steps", 1, "--preset", "paper", "--out", "o", "-q")
+    assert answer.code == 2 and "Traceback" not in answer.err
+    assert "of 64x48 pixels (0.0 megapixels) does not fit the memory. Make the pictures smaller" in answer.err
+
+
+def test_other_errors_are_left_as_they_are():
+    with pytest.raises(RuntimeError, match="shapes"), fitting_memory("A pair", (4, 3)):
+        raise RuntimeError("shapes differ")
+    with pytest.raises(InputError, match="bad name"), fitting_memory("A pair", (4, 3)):
+        raise InputError("bad name: out of memory.png")
+
+
+def test_the_expected_error_of_a_large_picture_needs_little_beside_itself():
+    depth_m = np.full((3000, 4000), 2.0, np.float32)
+    E = np.eye(4)
+    E[:3, 3] = 0.1, 0.02, 0.05
+    tracemalloc.start()
+    error_m = expected_error(depth_m, np.array([[900.0, 0, 2000], [0, 900, 1500], [0, 0, 1]]), [E], 0.01)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2 * error_m.nbytes
+    row, column = 2900, 17
+    ray = np.array([(column - 2000) / 900, (row - 1500) / 900])
+    moved = 900 * np.linalg.norm(E[:2, 3] - ray * E[2, 3])
+    expected = np.hypot((2 - E[2, 3]) ** 2 * MATCH_NOISE_PX / moved, 0.02)
+    assert error_m[row, column] == pytest.approx(expected)
+
+
+def test_a_finished_capture_is_exported_for_splats_and_read_back(scan, geodiff):
+    answer = geodiff(*typed(scan, "--export", "nerfstudio", "--points", "tracks"))
+    assert answer.code in (0, 4), answer.err
+    exported = scan / "out/nerfstudio"
+    (frame,) = json.loads((exported / "transforms.json").read_text())["frames"]
+    units = np.asarray(Image.open(exported / frame["depth_file_path"]))
+    depth = np.load(scan / "out/f01/depth.npy")
+    known = units > 0
+    assert known.mean() > 0.5
+    np.testing.assert_allclose(units[known] * 1e-3, depth[known], atol=6e-4)
+    np.testing.assert_array_equal(np.asarray(Image.open(exported / frame["depth_mask_path"])) > 0, known)
