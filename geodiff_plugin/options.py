@@ -23,6 +23,8 @@ DTYPES = ("float32", "float16", "bfloat16")
 #: Keys of ``scale.space.SPACES``, which cannot be imported without torch; a test keeps them the same.
 SPACES = ("depth", "disparity", "log", "log1p", "sqrt_disparity")
 PRESETS = ("default", "fast", "paper")
+#: What works on many items.
+ENGINES = ("local", "ray")
 
 
 class Command(NamedTuple):
@@ -87,6 +89,27 @@ def check_options(options: Any, name_of: Callable[[Field[Any]], str] = flag_of) 
                 check_number(entry, name, rules["low"], rules["high"], integer="int" in str(field.type))
             if rules["above_0"]:
                 check_positive(entry, name, rules["above_0"])
+
+
+def workers_option() -> Any:
+    """How many processes of Ray hold the prior."""
+    about = "With --engine ray: processes with the prior (default: as many as fit)."
+    return declare(None, about, low=1, high=10**6, panel=OUTPUT)
+
+
+def gpus_option() -> Any:
+    """GPUs of each process of Ray."""
+    about = "With --engine ray: GPUs of each process, also a fraction (default: 1 where there are any)."
+    return declare(None, about, low=0, high=64, panel=OUTPUT)
+
+
+def check_engine(options: Any) -> None:
+    """Refuse options of Ray without it, and shards with it."""
+    if options.engine == "ray" and getattr(options, "shard", None) is not None:
+        refuse("--shard cannot be used with --engine ray, which divides the work by itself.")
+    for name in ("workers", "gpus"):
+        if options.engine != "ray" and getattr(options, name) is not None:
+            refuse(f"--{name} needs --engine ray.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -47,10 +47,11 @@ def _depth(options: DepthOptions) -> None:
     elif is_many(options.left):
         options = replace(options, out=options.out or Path("geodiff-out"))
         refs = start_many(options, silent if options.quiet else say)
-        _imported("cli.run.run_many")(options, refs)
+        to_parquet = options.engine == "ray" and options.layout != "folders"
+        _imported("cli.run.run_parquet" if to_parquet else "cli.run.run_many")(options, refs)
     else:
         options.refuse(["steady"], "{} needs frames in order: folders, a list, videos or a bag.")
-        options.refuse(["shard"], "{} divides many pairs: give folders, a list or videos.")
+        options.refuse(["shard", "engine"], "{} is for many pairs: give folders, a list or videos.")
         options = with_folder(options, "geodiff-out")
         with start_pair(options) as folder:
             started = time.perf_counter()

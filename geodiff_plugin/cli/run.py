@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,15 @@ from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, new_table, show
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.jobs.bag import depth_bag
 from geodiff_plugin.jobs.capture import depth_capture
-from geodiff_plugin.jobs.many import Row, depth_pairs
+from geodiff_plugin.jobs.finished import Row
+from geodiff_plugin.jobs.many import depth_pairs
 from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions
 from geodiff_plugin.jobs.pair import depth_pair
 from geodiff_plugin.jobs.pairs import PairRef
 from geodiff_plugin.jobs.records import JobLog
 from geodiff_plugin.jobs.report import report_text, summary_line
 from geodiff_plugin.jobs.telling import Tell, collected_warnings, say, silent
+from geodiff_plugin.options import imported
 from geodiff_plugin.types import UNTESTED
 
 #: A table of more pairs than this shows only failed and untrusted ones.
@@ -55,6 +58,20 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
     with collected_warnings():
         rows = depth_pairs(options, refs, tell=_tell(options), progress=not options.quiet)
     answer_rows(rows, options.out, options.json, options.quiet)
+
+
+def run_parquet(options: DepthOptions, refs: Sequence[PairRef]) -> None:
+    """Many pairs into Parquet files, by Ray; the answer is what it comes to."""
+    with collected_warnings():
+        to_parquet = imported("jobs.cluster.pairs_to_parquet")
+        result = to_parquet(options, refs, tell=_tell(options), progress=not options.quiet)
+    if options.json:
+        print(json.dumps(asdict(result), indent=2))
+    elif not options.quiet:
+        totals = f"{result.done} done, {result.there} there already, {len(result.failed)} failed"
+        print(f"{len(refs)} pairs: {totals}, {result.not_trusted} not trusted -> {result.uri}")
+    if result.failed:
+        sys.exit(EXIT_SOME_FAILED)
 
 
 def run_bag(options: DepthOptions) -> None:

@@ -11,13 +11,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from geodiff_plugin.options import (
     DTYPES,
+    ENGINES,
     OUTPUT,
     Command,
     PriorOptions,
+    check_engine,
     check_options,
     declare,
     flag_of,
+    gpus_option,
     imported,
+    workers_option,
 )
 
 if TYPE_CHECKING:
@@ -163,6 +167,13 @@ class DirOptions(PairsOptions):
         "Folder of data sets, or the name of a registered set.", "", default=MISSING
     )
     methods: tuple[str, ...] = listed(PEERS, "Methods, separated by commas; geodiff eval list names them.")
+    engine: str = declare("local", "local, or ray (a cluster, extra 'ray').", choices=ENGINES, panel=OUTPUT)
+    workers: int | None = workers_option()
+    gpus: float | None = gpus_option()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_engine(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,7 +269,7 @@ def command_line(name: str, options: Any) -> str:
     """The command line that gives these options, defaults and what changes no number left out."""
     words, without = (
         [*options.program.split(), name],
-        ("out", "results", "quiet", "skip_broken", "save_depth"),
+        ("out", "results", "quiet", "skip_broken", "save_depth", "engine", "workers", "gpus"),
     )
     for each in fields(options):
         value, rules = getattr(options, each.name), each.metadata

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import importlib
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from operator import itemgetter
 from typing import NamedTuple
@@ -18,9 +19,12 @@ from geodiff_plugin.evaluation import experiment, tables
 from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, select
 from geodiff_plugin.evaluation.experiment import Page
-from geodiff_plugin.evaluation.options import PairsOptions
+from geodiff_plugin.evaluation.options import DirOptions, PairsOptions
 from geodiff_plugin.evaluation.tables import Table, cell, count_of_pairs, mean_cell, pairs_of
-from geodiff_plugin.jobs.journal import Item, Record, Shard
+from geodiff_plugin.jobs.failures import Failures
+from geodiff_plugin.jobs.journal import Item, Journal, Record, Shard
+from geodiff_plugin.jobs.telling import silent
+from geodiff_plugin.options import imported
 from geodiff_plugin.priors import PRIORS, find_prior
 
 
@@ -66,9 +70,28 @@ def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
     return remarks
 
 
-def run_pairs(name: str, options: PairsOptions) -> Page | None:
+def _measure_on_ray(refs: Sequence[SampleRef], options: DirOptions) -> None:
+    """Measure the cells without a record by Ray; this process tries those that fail there, and tells why."""
+    items_on_actors = imported("jobs.cluster.items_on_actors")
+    cells = {cell.key: cell for cell in pair_cells(refs, options.methods, options)}
+    make = partial(_cells_by_key, options, modules_of_datasets())
+    with Journal(options.out / experiment.RECORDS_NAME) as journal:
+        failures = Failures(len(cells), "cell", silent)
+        items_on_actors(list(cells.values()), journal, make, options, failures, not options.quiet)
+
+
+def _cells_by_key(options: DirOptions, modules: Sequence[str]) -> Callable[[str], Record]:
+    """What an actor does with the key of a cell."""
+    _import_all(modules)
+    cells = {cell.key: cell for cell in pair_cells(select(options), options.methods, options)}
+    return lambda key: cells[key].payload()
+
+
+def run_pairs(name: str, options: DirOptions) -> Page | None:
     """Measure methods on pairs and write the tables; errors as ``run_experiment``."""
     refs, more = select(options), []
+    if options.engine == "ray":
+        _measure_on_ray(refs, options)
     if options.sample is not None:
         more.append(f"Drawn with seed {options.seed}: {', '.join(ref.label for ref in refs)}.")
     return compare(name, options, "Results pair by pair", refs, options.methods, tables.pairs_tables, more)
@@ -240,11 +263,15 @@ def _import_all(modules: Sequence[str]) -> None:
         importlib.import_module(module)
 
 
+def modules_of_datasets() -> list[str]:
+    """The modules that another process imports to know every registered data set."""
+    # A file that was run is read again by a new process, but not what `python -m` ran.
+    return sorted({dataset.load.__module__ for dataset in DATASETS.values()} - {"__main__"})
+
+
 def fresh_process() -> ProcessPoolExecutor:
     """One new process, which knows every registered data set."""
-    # A file that was run is read again by a new process, but not what `python -m` ran.
-    modules = sorted({dataset.load.__module__ for dataset in DATASETS.values()} - {"__main__"})
-    context = get_context("spawn")
+    context, modules = get_context("spawn"), modules_of_datasets()
     return ProcessPoolExecutor(1, mp_context=context, initializer=_import_all, initargs=(modules,))
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats import recordings
 from geodiff_plugin.formats.out import check_new_file, write_text
-from geodiff_plugin.jobs.many import Row, depth_pairs
+from geodiff_plugin.jobs.finished import Row
+from geodiff_plugin.jobs.many import depth_pairs
 from geodiff_plugin.jobs.options import PARAMETERS, DepthOptions
 from geodiff_plugin.jobs.pairs import start_many
 from geodiff_plugin.jobs.report import read_report
@@ -43,7 +44,7 @@ def depth_bag(options: DepthOptions, *, tell: Tell = silent, progress: bool = Fa
     if out.suffix not in recordings.BAG_SUFFIXES or out.is_dir():
         expected = f"a file that ends in {' or '.join(recordings.BAG_SUFFIXES)}, as LEFT is a bag"
         bad_value("--out", expected, out)
-    options.refuse(["shard"], "{} cannot be used with a bag, which is written as one.")
+    options.refuse(["shard", "engine"], "{} cannot be used with a bag, which is written as one.")
     check_new_file(out, options.overwrite)
     pairs = recordings.list_pairs(options.left, topics, options.tolerance)
     frames = out.with_name(f"{out.stem}-frames")

@@ -26,6 +26,7 @@ from geodiff_plugin.capture.results import ALONE, save_alone, write_agreement, w
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
 from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, check_new, working_in, write_text
+from geodiff_plugin.jobs.failures import Failures
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Record, Shard, shards_beside
 from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import OF_SCALE, CaptureOptions
@@ -37,6 +38,7 @@ from geodiff_plugin.jobs.stopping import ending_with_parent
 from geodiff_plugin.jobs.telling import Tell, collected_warnings, say, silent
 from geodiff_plugin.jobs.writing import write_maps
 from geodiff_plugin.messages import Message, as_records
+from geodiff_plugin.options import imported
 from geodiff_plugin.pose.multiview import SolvedCapture
 from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.types import MetricDepthOutput
@@ -234,12 +236,36 @@ def _run_frames(
     items = [Item(name, inputs=keys.frames_key, head={"frame": name}) for name in names]
     if not shard.whole:
         return _work(capture, options, items, shard, progress)
+    if options.engine == "ray":
+        return _frames_on_ray(options, items, keys, progress)
     with Journal(path) as journal:
         count = _processes(options, sum(journal.get(item) is None for item in items))
         if count > 1 and _in_processes(capture, options, items, keys, count, progress):
             made = journal.read()
             return [made[item.key, item.inputs] for item in items]
     return _work(capture, options, items, shard, progress)  # all, or what a lost process has left
+
+
+def _frames_on_ray(
+    options: CaptureOptions, items: Sequence[Item], keys: RunKeys, progress: bool
+) -> list[Record]:
+    """The frames by actors of Ray, each of which opens the capture and its poses."""
+    items_on_actors = imported("jobs.cluster.items_on_actors")
+    make = partial(_frame_by_name, replace(options, overwrite=False), keys)
+    with Journal(options.out / JOURNAL) as journal:
+        for item in items:
+            if not _is_made(item, options.out / item.key):
+                journal.forget(item)
+        return items_on_actors(items, journal, make, options, Failures(len(items), "frame", say), progress)
+
+
+def _frame_by_name(options: CaptureOptions, keys: RunKeys) -> Callable[[str], Record]:
+    """What an actor does with the name of a frame."""
+    with collected_warnings(silent):  # the driver has told them
+        capture = open_capture(options)
+        solved_poses(capture, options, keys.poses_key, keys.factor)
+    loaded = cache(partial(_pipe, options))
+    return lambda name: _make_frame(capture, options, loaded, Item(name, inputs=keys.frames_key))
 
 
 def _in_processes(

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+import errno
 import traceback
 from collections.abc import Callable
 
 from geodiff_plugin._checks import InputError
+from geodiff_plugin.formats.out import reason_of
 from geodiff_plugin.jobs.journal import Item
 
 #: Items of one cause that are named.
 MOST_NAMES = 5
+#: With one of these causes the next item cannot be written either.
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+def full_disk(error: BaseException) -> InputError | None:
+    """What to say where an error comes from a full disk, which ends a whole run; ``None`` for all others."""
+    cause: BaseException | None = error
+    while cause is not None and getattr(cause, "errno", None) not in DISK_FULL:
+        cause = cause.__cause__ or cause.__context__
+    if not isinstance(cause, OSError):
+        return None
+    resumes = "Finished pairs stay; the same command goes on with the rest."
+    return InputError(f"The disk of --out is full ({reason_of(cause)}). {resumes}")
 
 
 class Failures:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -12,15 +11,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from geodiff_plugin._checks import InputError, bad_value, refuse
+from geodiff_plugin._checks import InputError, refuse
 from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin._threads import WithinCores
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.formats import recordings
-from geodiff_plugin.formats.files import file_digest
-from geodiff_plugin.formats.out import OutFolder, reason_of
+from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.formats.reading import has_pose_per_image
+from geodiff_plugin.jobs.failures import full_disk
+from geodiff_plugin.jobs.finished import Row, file_digests, finished_row, row_of
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard
 from geodiff_plugin.jobs.options import DepthOptions, start_pair
 from geodiff_plugin.jobs.pair import run_pair, write_pair
@@ -28,24 +28,15 @@ from geodiff_plugin.jobs.pairs import COLUMNS, SUMMARY, PairRef, options_of
 from geodiff_plugin.jobs.prior import prior_of_options
 from geodiff_plugin.jobs.reading import PairInputs, read_pair
 from geodiff_plugin.jobs.records import JobLog, PairRun
-from geodiff_plugin.jobs.report import read_report
 from geodiff_plugin.jobs.runner import Runner
 from geodiff_plugin.jobs.steady import write_steady_frames
 from geodiff_plugin.jobs.tables import write_table
 from geodiff_plugin.jobs.telling import Tell, silent
-from geodiff_plugin.options import flag_of
+from geodiff_plugin.options import imported
 from geodiff_plugin.runtime.machine import pick_device
 
 #: What became of every pair.
 JOURNAL = ".pairs.jsonl"
-#: Options that a result does not depend on.
-NOT_OF_THE_RESULT = {
-    *("out", "overwrite", "quiet", "json", "strict", "steady", "shard"),
-    *("device", "graphs", "no_kernels", "encoding"),
-}
-#: With one of these causes the next pair cannot be written either.
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-Row = dict[str, Any]
 
 
 class _EndsRun(BaseException):
@@ -57,12 +48,7 @@ def _ends_run_on_full_disk() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        cause: BaseException | None = error
-        while cause is not None and getattr(cause, "errno", None) not in DISK_FULL:
-            cause = cause.__cause__ or cause.__context__
-        if isinstance(cause, OSError):
-            resumes = "Finished pairs stay; the same command goes on with the rest."
-            full = InputError(f"The disk of --out is full ({reason_of(cause)}). {resumes}")
+        if (full := full_disk(error)) is not None:
             raise _EndsRun from full
         raise
 
@@ -136,7 +122,7 @@ class Stages:
         held = self._folders[item.key] = ExitStack()
         with _ends_run_on_full_disk():
             held.enter_context(folder)
-        digests = _digests(options)  # before: what changes later is another version
+        digests = file_digests(options)  # before: what changes later is another version
         entries = {"pair": {"name": ref.name, "frame": ref.frame, "sha256": digests}}
         log = JobLog()
         with log.stage("calibration"):
@@ -173,63 +159,11 @@ class Stages:
         """The files, the report last, and the row of the table."""
         assert pair.run is not None
         with _ends_run_on_full_disk():
-            return _row(write_pair(pair.folder, pair.run, **pair.entries).report)
+            return row_of(write_pair(pair.folder, pair.run, **pair.entries).report)
 
     def release(self, item: Item) -> None:
         """Give back the folder of a pair."""
         self._folders.pop(item.key, ExitStack()).close()
-
-
-def _digests(options: DepthOptions) -> dict[str, str]:
-    """SHA-256 by path of the readable files that a pair is made from."""
-    digests = {}
-    for path in options.read_files():
-        with suppress(OSError):  # its reader says why
-            digests[str(path)] = file_digest(path)
-    return digests
-
-
-def finished_row(options: DepthOptions) -> Row | None:
-    """The row of a pair that an earlier run has finished; ``None`` where it is still to be done.
-
-    A result of other options, or of files whose content has changed since, is an error.
-    """
-    assert options.out is not None
-    report = read_report(options.out)
-    try:
-        made, row = report["arguments"], _row(report)
-        # The report is written last and names every file, so a folder that holds all of them is whole.
-        if not all((options.out / name).stat().st_size > 0 for name in report["files"]["names"]):
-            return None
-    except (OSError, KeyError, TypeError):
-        return None
-    wanted, of_fields = options.as_json(), DepthOptions.__dataclass_fields__
-    others = [n for n in wanted if n not in NOT_OF_THE_RESULT and wanted[n] != made.get(n, wanted[n])]
-    changes = [f"made with {flag_of(of_fields[n])} {made[n]} instead of {wanted[n]}" for n in others]
-    digests = report.get("pair", {}).get("sha256", {})
-    changed = [path for path, digest in _digests(options).items() if digests.get(path, digest) != digest]
-    changes += [f"made before {path} changed" for path in changed]
-    if changes:
-        cure = "Name another --out, add --overwrite to repeat all pairs, or remove this folder to repeat one."
-        got = f"{options.out}, {', '.join(changes)}"
-        bad_value("--out", "a folder of results of the same options and files", got, cure)
-    return row
-
-
-def _row(report: dict[str, Any]) -> Row:
-    """What the table says of a pair, and why it is not to be trusted."""
-    depth, verdict = report["depth"], report["verdict"]
-    return {
-        "near_m": depth["min_m"],
-        "median_m": depth["median_m"],
-        "far_m": depth["max_m"],
-        "verdict": verdict["status"],
-        "confidence": verdict["indicators"]["confidence"] if verdict["status"] == "trusted" else None,
-        "seconds": round(sum(report["seconds"].values()), 3),
-        "message": " ".join(report["warnings"]) or None,
-        "reasons": " ".join(verdict["reasons"]),
-        "codes": " ".join(message["code"] for message in report.get("messages", ())) or None,
-    }
 
 
 def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
@@ -272,8 +206,13 @@ def depth_pairs(
     with Journal(options.out / JOURNAL, shard) as journal:
         items = [Item(r.name, r, words=(str(r.left), str(r.right), str(options.out / r.name))) for r in refs]
         there = _rows_there(items, options, journal)
-        runner = Runner(items, journal, noun="pair", survives=(Exception,), progress=progress)
-        records = _through(Stages(options, device, tell=tell), runner)
+        with _nothing_left_if_all_fail(journal):
+            if options.engine == "ray":
+                pairs_to_folders = imported("jobs.cluster.pairs_to_folders")
+                records = pairs_to_folders(options, items, journal, tell=tell, progress=progress)
+            else:
+                runner = Runner(items, journal, noun="pair", survives=(Exception,), progress=progress)
+                records = _through(Stages(options, device, tell=tell), runner)
         rows = [_final(record, there.get(record["key"]), options, tell) for record in records]
         write_table(shard.path(options.out / SUMMARY), rows, tell)
         if options.steady:
@@ -307,15 +246,22 @@ def _through(stages: Stages, runner: Runner) -> list[Row]:
     except _EndsRun as ended:
         assert ended.__cause__ is not None
         raise ended.__cause__ from None
-    except InputError:  # all of them, for one reason: no folder is left behind
-        journal = runner.journal
-        with suppress(OSError):
-            journal.close()  # Windows removes no open file
-            journal.path.unlink()
-            journal.path.parent.rmdir()
-        raise
     finally:
         stages.close()
+
+
+@contextmanager
+def _nothing_left_if_all_fail(journal: Journal) -> Iterator[None]:
+    """Remove the journal, and the folder that holds nothing else, where the run itself ends with an error."""
+    try:
+        yield
+    except InputError:
+        with suppress(OSError):
+            journal.close()  # Windows removes no open file
+            if not any(path for path in journal.path.parent.iterdir() if path != journal.path):
+                journal.path.unlink()
+                journal.path.parent.rmdir()
+        raise
 
 
 def _final(record: Row, there: Row | None, options: DepthOptions, tell: Tell) -> Row:

@@ -14,7 +14,19 @@ from geodiff_plugin._checks import bad_value, refuse
 from geodiff_plugin.capture import NEIGHBOURS, POINTS
 from geodiff_plugin.formats.files import check_file, open_image
 from geodiff_plugin.formats.out import OutFolder, free_folder
-from geodiff_plugin.options import CAMERAS, OUTPUT, PriorOptions, RunOptions, check_options, declare, flag_of
+from geodiff_plugin.options import (
+    CAMERAS,
+    ENGINES,
+    OUTPUT,
+    PriorOptions,
+    RunOptions,
+    check_engine,
+    check_options,
+    declare,
+    flag_of,
+    gpus_option,
+    workers_option,
+)
 
 #: What is read of a COLMAP model, the one kind of calibration that is a folder.
 MODEL_FILES = ("cameras.txt", "images.txt")
@@ -27,6 +39,8 @@ WAYS = {
     "parameters": (*PARAMETERS[:-1], "cx_right"),
     "--fov": ("fov",),
 }
+#: What Ray writes.
+LAYOUTS = ("parquet", "folders")
 #: The ways to give the scale of a capture.
 OF_SCALE = ("metres_per_unit", "known_length", "distance")
 #: Files of stereo cameras that hold both pictures, by suffix.
@@ -156,6 +170,14 @@ class DepthOptions(RunOptions):
         "Also write glb (point cloud), mesh (textured GLB) or colmap (sparse model); repeatable.",
         choices=("glb", "mesh", "colmap"),
     )
+    engine: str = _output(
+        "local", "Of many pairs: local, or ray (Ray Data on a cluster, extra 'ray').", choices=ENGINES
+    )
+    layout: str | None = _output(
+        None, "With --engine ray: parquet (default) or folders, as without it.", "--as", choices=LAYOUTS
+    )
+    workers: int | None = workers_option()
+    gpus: float | None = gpus_option()
     shard: str | None = _output(
         None, "Of many pairs: do part I of N, from 0/N on; geodiff merge joins the tables.", metavar="I/N"
     )
@@ -271,6 +293,17 @@ class DepthOptions(RunOptions):
             ),
             _Exclusion(paper, ("view",), "{} cannot be used with --preset paper: Algorithm 1 has two views."),
             _Exclusion(posed, ("fov", "known_length"), "{} needs --estimate-pose."),
+            _Exclusion(self.engine != "ray", ("layout", "workers", "gpus"), "{} needs --engine ray."),
+            _Exclusion(
+                self.engine == "ray",
+                ("shard",),
+                "{} is not for --engine ray, which divides by itself.",
+            ),
+            _Exclusion(
+                self.engine == "ray" and self.layout != "folders",
+                ("steady", "export"),
+                "{} needs --as folders where the engine is Ray.",
+            ),
             _Exclusion(not posed, ("calib", "cameras", "e", "view_e", "cx_right"), f"{with_poses}, {for_k}"),
             _Exclusion(not posed, ("steady",), f"{with_poses}: every pair has a scale of its own."),
             _Exclusion(
@@ -398,6 +431,9 @@ class CaptureOptions(PriorOptions):
         None, "Take another model's depth maps as the prior: a folder with NAME.npy for each frame."
     )
     processes: int | None = declare(None, "Number of processes (default: one per core).", low=1, high=1024)
+    engine: str = _output("local", "local, or ray (a cluster, extra 'ray').", choices=ENGINES)
+    workers: int | None = workers_option()
+    gpus: float | None = gpus_option()
     poses_only: bool = _output(False, "Only solve the poses; runs with --shard then start from them.")
     shard: str | None = _output(
         None,
@@ -419,6 +455,7 @@ class CaptureOptions(PriorOptions):
 
     def __post_init__(self) -> None:
         check_options(self)
+        check_engine(self)
         given = [f"--{way.replace('_', '-')}" for way in OF_SCALE if getattr(self, way) is not None]
         if len(given) > 1:
             refuse(f"The scale is given in several ways, by {' and '.join(given)}. Give one of them.")

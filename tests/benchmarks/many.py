@@ -1,7 +1,7 @@
 """What ``geodiff depth`` on many pairs gains by stages side by side: the same pairs, one after the other.
 
 Data flow: rendered pairs in two folders -> the stages of the command, overlapped and not -> a table
-    (``python -m tests.benchmarks.many``).
+    (``python -m tests.benchmarks.many``); with ``--engine ray``, the command by one process and by Ray.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import start_many
 from geodiff_plugin.jobs.prior import load_guided_prior
 from geodiff_plugin.jobs.runner import Runner
+from geodiff_plugin.options import ENGINES
 from geodiff_plugin.runtime.machine import pick_device
 from tests.scenes import render_pair
 
@@ -115,7 +116,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--prior", default="bundled")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="rows for each")
     parser.add_argument("--repeats", type=int, default=3, help="the ways in turn; the median counts")
+    parser.add_argument("--engine", choices=ENGINES, default="local", help="ray: compare the engines instead")
+    parser.add_argument("--workers", type=int, default=2, help="of Ray")
     options = parser.parse_args(arguments)
+    if options.engine == "ray":
+        from tests.benchmarks.engines import compare_engines  # of the extra ray
+
+        with tempfile.TemporaryDirectory() as folder:
+            typed = write_pairs(Path(folder), options.pairs, tuple(options.size))
+            typed = replace(typed, device=options.device, prior=options.prior)
+            compare_engines(typed, options.pairs, options.workers, Path(folder))
+        return
     table = new_table(("threads", *WAYS, "ratio"), "seconds of a clock (of all cores) a pair")
     before = torch.get_num_threads()
     with tempfile.TemporaryDirectory() as folder:

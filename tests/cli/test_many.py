@@ -242,7 +242,7 @@ def test_shards_in_turn_give_what_the_whole_run_gives_and_merge_joins_their_tabl
 
 
 def test_what_shards_cannot_do_is_said(geodiff, fresh):
-    assert "--shard divides many pairs" in geodiff("depth", "left/a.png", "right/a.png", "--shard", "0/2").err
+    assert "--shard is for many pairs" in geodiff("depth", "left/a.png", "right/a.png", "--shard", "0/2").err
     assert "--shard must be I/N" in geodiff(*COMMAND, "--shard", "2/2").err
     assert "--steady needs all frames" in geodiff(*COMMAND, "--shard", "0/2", "--steady").err
     assert "holds no table of a shard" in geodiff("merge", "left").err

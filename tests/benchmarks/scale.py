@@ -1,0 +1,113 @@
+"""What a million pairs take, as arithmetic: hours, terabytes, and cores that feed the cards.
+
+Data flow: milliseconds of a guided call (given, from a table of ``tests.benchmarks.gpu``), bytes and CPU
+    seconds of the demo pair (measured here) -> a table (``python -m tests.benchmarks.scale``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+
+from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
+from geodiff_plugin.cli.terminal import new_table, show
+from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.jobs.pair import run_pair
+from geodiff_plugin.jobs.prior import prior_of_options
+from geodiff_plugin.jobs.rows import GuidedPair, ReadPair, read_columns, result_columns
+from geodiff_plugin.runtime.machine import pick_device
+
+__all__ = ["Pair", "main"]
+
+CARDS = (1, 8, 64)
+SECONDS_AN_HOUR = 3600
+REPEATS = 5
+
+
+@dataclass(frozen=True)
+class Pair:
+    """What a pair takes beside its guided call.
+
+    Attributes:
+        read_bytes: of its two image files.
+        written_bytes: of its row.
+        read_seconds: of one core, to decode it and make it ready.
+        write_seconds: of one core, to encode its row.
+    """
+
+    read_bytes: int
+    written_bytes: int
+    read_seconds: float
+    write_seconds: float
+
+
+def measure_pair() -> Pair:
+    """Read the demo pair as a row, guide it by the bundled prior, and encode its result."""
+    images = {side: DEMO_PAIR_FOLDER / f"{side}.png" for side in ("left", "right")}
+    options = DepthOptions(left=Path(), device="cpu", steps=1)
+    row = {"key": "demo", "calib": str(DEMO_PAIR_FOLDER / "calib.txt")}
+    row |= {side: path.read_bytes() for side, path in images.items()}
+
+    def read() -> ReadPair:
+        return read_columns(options, row)
+
+    pair = read()
+    run = run_pair(prior_of_options(options, pick_device("cpu")), pair.options, pair.inputs, pair.log)
+    columns = result_columns(GuidedPair(run, {}))
+    return Pair(
+        read_bytes=sum(path.stat().st_size for path in images.values()),
+        written_bytes=len(columns["depth_mm"]) + len(columns["confidence"]),
+        read_seconds=_core_seconds(read),
+        write_seconds=_core_seconds(lambda: result_columns(GuidedPair(run, {}))),
+    )
+
+
+def _core_seconds(work: Callable[[], Any]) -> float:
+    """Seconds of one core, the median of some runs."""
+    taken = []
+    for _ in range(REPEATS):
+        started = time.process_time()
+        work()
+        taken.append(time.process_time() - started)
+    return median(taken)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table; ``--help`` lists the options."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--ms", type=float, required=True, help="milliseconds of a guided call on one card")
+    parser.add_argument("--pairs", type=int, default=1_000_000)
+    parser.add_argument(
+        "--driver-bytes", type=int, default=0, help="of a listed pair (tests.benchmarks.many)"
+    )
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    pair = measure_pair()
+    title = f"{options.pairs:,} pairs of the demo pair's size at {options.ms:g} ms a call, one worker a card"
+    headings = ("cards", "pairs a second", "hours", "MB a second read", "MB a second written", "cores busy")
+    table = new_table(headings, title)
+    for cards in CARDS:
+        rate = 1000 * cards / options.ms
+        hours = options.pairs / rate / SECONDS_AN_HOUR
+        flows = f"{rate * pair.read_bytes / 1e6:.1f}", f"{rate * pair.written_bytes / 1e6:.1f}"
+        cores = rate * (pair.read_seconds + pair.write_seconds)
+        table.add_row(f"{cards}", f"{rate:.1f}", f"{hours:.1f}", *flows, f"{cores:.1f}")
+    show(table)
+    print(
+        f"Read {options.pairs * pair.read_bytes / 1e12:.2f} TB, "
+        f"written {options.pairs * pair.written_bytes / 1e12:.2f} TB."
+    )
+    print(f"CPU seconds of a pair: {pair.read_seconds:.3f} to read, {pair.write_seconds:.3f} to encode.")
+    if options.driver_bytes:
+        print(f"The list of pairs takes {options.pairs * options.driver_bytes / 1e9:.1f} GB of the driver.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,410 @@
+"""Many pairs on a real Ray of two workers: the files of one process, whatever breaks on the way."""
+
+import contextlib
+import csv
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from PIL import Image
+
+ray = pytest.importorskip("ray", reason="ray is in the extra ray")
+psutil = pytest.importorskip("psutil")
+pq = pytest.importorskip("pyarrow.parquet")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]
+
+from geodiff_plugin import InputError  # noqa: E402
+from geodiff_plugin.cli.app import main  # noqa: E402
+from geodiff_plugin.formats.depth import depth_mm  # noqa: E402
+from geodiff_plugin.jobs.options import DepthOptions  # noqa: E402
+from geodiff_plugin.jobs.ray import Workers, depth_dataset  # noqa: E402
+from geodiff_plugin.jobs.rows import COLUMNS  # noqa: E402
+from tests.benchmarks.many import write_pairs  # noqa: E402
+
+PAIRS, FEW, SIZE = 24, 8, (64, 96)
+QUICK = "--steps 1 --preset paper --device cpu -q".split()
+RAY = ["--engine", "ray", "--workers", "2"]
+LAYOUTS = ("folders", "parquet")
+#: Begins what a process of Ray that holds the prior calls itself.
+ACTOR = "ray::MapWorker"
+
+
+class Answer(NamedTuple):
+    """Of a command: its exit code and what it printed."""
+
+    code: int
+    out: str
+    err: str
+
+
+class Pairs(NamedTuple):
+    """Rendered pairs in ``left`` and ``right``, and in ``one`` what one process makes of them."""
+
+    folder: Path
+    cameras: dict[str, float]
+
+    @property
+    def one(self) -> Path:
+        return self.folder / "one"
+
+    def words(self) -> list[str]:
+        camera = [word for name, value in self.cameras.items() for word in (f"--{name}", str(value))]
+        return ["depth", str(self.folder / "left"), str(self.folder / "right"), *camera, *QUICK]
+
+
+def start(words: list[str]) -> subprocess.Popen:
+    """A command in a process of its own, which starts a Ray of its own if it needs one."""
+    environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
+    environment |= {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-m", "geodiff_plugin", *words]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, env=environment, process_group=0, **pipes)
+
+
+def alone(words: list[str]) -> Answer:
+    process = start(words)
+    out, err = process.communicate(timeout=1800)
+    return Answer(process.returncode, out, err)
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[None]:
+    """A Ray with two CPUs, whose processes the commands of this process share."""
+    before = {name: os.environ.get(name) for name in ("OMP_NUM_THREADS", "PYTHONPATH")}
+    os.environ |= {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+    yield
+    ray.shutdown()
+    for name, value in before.items():
+        os.environ.pop(name)
+        if value is not None:
+            os.environ[name] = value
+
+
+def call(words: list[str]) -> Answer:
+    """A command in this process."""
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main(words)
+        except SystemExit as leaving:
+            code = int(leaving.code or 0)
+    return Answer(code, out.getvalue(), err.getvalue())
+
+
+def rendered(folder: Path, count: int) -> Pairs:
+    folder.mkdir(exist_ok=True)
+    options = write_pairs(folder, count, SIZE)
+    pairs = Pairs(folder, {name: getattr(options, name) for name in ("fx", "fy", "cx", "cy", "baseline")})
+    answer = alone([*pairs.words(), "--out", str(pairs.one)])
+    assert answer.code == 0, answer.err
+    return pairs
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory) -> Pairs:
+    return rendered(tmp_path_factory.mktemp("many"), PAIRS)
+
+
+@pytest.fixture(scope="module")
+def few(many, tmp_path_factory) -> Pairs:
+    """The first of ``many``."""
+    folder = tmp_path_factory.mktemp("few")
+    for name in (f"{n:06}" for n in range(FEW)):
+        shutil.copytree(many.one / name, folder / "one" / name)
+        for side in ("left", "right"):
+            (folder / side).mkdir(exist_ok=True)
+            shutil.copy(many.folder / side / f"{name}.png", folder / side)
+    return many._replace(folder=folder)
+
+
+def contents(folder: Path) -> dict[str, object]:
+    """Files of pairs by their names: the bytes, and of reports what does not change from run to run."""
+    found: dict[str, object] = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.parent != folder:
+            found[str(path.relative_to(folder))] = path.read_bytes()
+            if path.name == "report.json":
+                found[str(path.relative_to(folder))] = unchanging(json.loads(path.read_text()))
+    return found
+
+
+def unchanging(report: dict) -> dict:
+    """Without times and places."""
+    del report["seconds"]
+    for name in ("out", "left", "right"):
+        del report["arguments"][name]
+    report["pair"]["sha256"] = sorted(report["pair"]["sha256"].values())
+    return report | {"inputs": None}
+
+
+def table_of(out: Path) -> list[dict]:
+    """The rows of ``pairs.csv`` without seconds."""
+    with open(out / "pairs.csv", newline="") as file:
+        return [
+            {name: value for name, value in row.items() if name != "seconds"} for row in csv.DictReader(file)
+        ]
+
+
+def rows_of(out: Path) -> dict[str, dict]:
+    """Rows of all Parquet files, no two of one key."""
+    rows = [row for path in sorted(out.glob("*.parquet")) for row in pq.read_table(path).to_pylist()]
+    assert len({row["key"] for row in rows}) == len(rows), "nothing twice"
+    return {row["key"]: row for row in rows}
+
+
+def check_rows(rows: dict[str, dict], pairs: Pairs) -> None:
+    """Rows hold what one process wrote into folders."""
+    assert sorted(rows) == sorted(path.name for path in pairs.one.iterdir() if path.is_dir())
+    for key, row in rows.items():
+        depth_m = np.load(pairs.one / key / "depth.npy")
+        np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(row["depth_mm"]))), depth_mm(depth_m))
+        report = json.loads((pairs.one / key / "report.json").read_text())
+        assert row["verdict"] == report["verdict"]["status"] and row["error"] is None
+        assert (row["height"], row["width"]) == depth_m.shape and row["fx"] == report["K"][0][0][0]
+
+
+def check_whole(out: Path, layout: str, pairs: Pairs) -> None:
+    """A folder of results holds those of one process, once each."""
+    if layout == "folders":
+        assert contents(out) == contents(pairs.one)
+    else:
+        check_rows(rows_of(out), pairs)
+        assert not list(out.glob(".*")), "files that are not whole"
+
+
+def results(out: Path, layout: str) -> dict[Path, int]:
+    """When every result was written."""
+    pattern = "*/report.json" if layout == "folders" else "part-*"
+    return {path: path.stat().st_mtime_ns for path in out.glob(pattern)}
+
+
+def test_folders_are_those_of_one_process_byte_for_byte(many, cluster, tmp_path):
+    out = tmp_path / "out"
+    words = [*many.words(), *RAY, "--as", "folders", "--out", str(out)]
+    answer = call(words)
+    assert answer.code == 0, answer.err
+    assert contents(out) == contents(many.one) and table_of(out) == table_of(many.one)
+    made = results(out, "folders")
+    shutil.rmtree(out / "000003")
+    answer = call(words)
+    assert answer.code == 0, answer.err
+    again = results(out, "folders")
+    assert [path.parent.name for path in again if again[path] != made[path]] == ["000003"]
+    assert contents(out) == contents(many.one)
+
+
+def test_parquet_holds_the_same_depth_and_a_second_run_does_what_is_missing(few, cluster, tmp_path):
+    out = tmp_path / "out"
+    words = [*few.words(), *RAY, "--out", str(out), "--json"]
+    answer = call(words)
+    assert answer.code == 0, answer.err
+    assert json.loads(answer.out)["done"] == FEW
+    check_whole(out, "parquet", few)
+    lost = sorted(out.glob("part-*"))[0]
+    missing = pq.read_table(lost)["key"].to_pylist()
+    lost.unlink()
+    made = results(out, "parquet")
+    answer = call(words)
+    assert answer.code == 0, answer.err
+    told = json.loads(answer.out)
+    assert (told["done"], told["there"]) == (len(missing), FEW - len(missing))
+    assert made.items() <= results(out, "parquet").items()
+    check_whole(out, "parquet", few)
+    answer = call([*words, "--seed", "3"])
+    assert answer.code == 2 and "made with --seed 0 instead of 3" in answer.err
+
+
+def broken(few: Pairs, folder: Path) -> list[str]:
+    """Words for a list with a torn image (1), a pair of another size (2) and one without cameras (3)."""
+    for side in ("left", "right"):
+        shutil.copytree(few.folder / side, folder / side)
+        other = folder / side / "000002.png"
+        Image.open(other).resize((160, 128)).save(other)
+    torn = folder / "left" / "000001.png"
+    torn.write_bytes(torn.read_bytes()[:500])
+    camera = "[{fx} 0 {cx}; 0 {fy} {cy}; 0 0 1]".format(**few.cameras)
+    calibration = f"cam0={camera}\ncam1={camera}\ndoffs=0\nbaseline={1000 * few.cameras['baseline']}\n"
+    (folder / "calib.txt").write_text(calibration)
+    lines = [f"left/{n:06}.png,right/{n:06}.png" + ("" if n == 3 else ",calib.txt") for n in range(FEW)]
+    (folder / "list.csv").write_text("\n".join(lines))
+    return ["depth", str(folder / "list.csv"), *QUICK]
+
+
+def test_broken_rows_are_rows_with_an_error_and_the_rest_is_done(few, cluster, tmp_path):
+    words = broken(few, tmp_path)
+    one = alone([*words, "--out", str(tmp_path / "one")])
+    for layout in LAYOUTS:
+        answer = call([*words, *RAY, "--as", layout, "--out", str(tmp_path / layout)])
+        assert answer.code == one.code == 4, answer.err
+        assert "000001: LEFT must be a whole image file" in answer.err
+    assert contents(tmp_path / "folders") == contents(tmp_path / "one")
+    table = table_of(tmp_path / "folders")
+    failed = {row["pair"]: row["message"] for row in table if row["result"] == "failed"}
+    assert failed == {r["pair"]: r["message"] for r in table_of(tmp_path / "one") if r["result"] == "failed"}
+    rows = rows_of(tmp_path / "parquet")
+    assert {key: row["error"] for key, row in rows.items() if row["error"]} == failed
+    assert list(failed) == ["000001", "000003"] and len(rows) == FEW and rows["000002"]["width"] == 160
+    shutil.copy(few.folder / "left" / "000001.png", tmp_path / "left")  # mended, both are done
+    listed = (tmp_path / "list.csv").read_text()
+    (tmp_path / "list.csv").write_text(listed.replace("right/000003.png\n", "right/000003.png,calib.txt\n"))
+    answer = call([*words, *RAY, "--out", str(tmp_path / "parquet"), "--json"])
+    assert json.loads(answer.out)["done"] == 2, answer.err
+    rows = rows_of(tmp_path / "parquet")
+    assert len(rows) == FEW and not any(row["error"] for row in rows.values())
+
+
+def test_what_holds_for_all_pairs_is_said_once_and_leaves_no_folder(few, cluster, tmp_path):
+    words = [*few.words()[:3], "--calib", str(few.folder / "left" / "000000.png"), *QUICK]
+    answer = call([*words, *RAY, "--as", "folders", "--out", str(tmp_path / "out")])
+    assert answer.code == 2 and "The same holds for all 8 pairs" in answer.err, answer.err
+    assert not (tmp_path / "out").exists()
+
+
+def actors() -> list[psutil.Process]:
+    """The processes of any Ray on this machine that hold the prior."""
+    every = [(each, each.info["cmdline"]) for each in psutil.process_iter(["cmdline"])]
+    return [each for each, words in every if words and words[0].startswith(ACTOR)]
+
+
+def below(process: psutil.Process) -> set[int]:
+    return {each.pid for each in process.children(recursive=True)}
+
+
+def when(happened, process: subprocess.Popen, seconds: float = 900.0):
+    """What ``happened`` returns, as soon as it is something."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and process.poll() is None:
+        if result := happened():
+            return result
+        time.sleep(0.05)
+    process.kill()
+    raise AssertionError(f"it never happened: {process.communicate()}")
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_worker_that_is_killed_in_the_middle_costs_nothing(few, tmp_path, layout):
+    out = tmp_path / "out"
+    process = start([*few.words(), *RAY, "--as", layout, "--out", str(out)])
+    when(lambda: results(out, layout), process)
+    ours = below(psutil.Process(process.pid))
+    victims = [each for each in actors() if each.pid in ours]
+    assert victims and len(results(out, "folders")) < FEW
+    victims[0].send_signal(signal.SIGKILL)
+    _, err = process.communicate(timeout=1800)
+    assert process.returncode == 0, err
+    check_whole(out, layout, few)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_driver_that_is_killed_and_started_again_does_what_is_missing(few, cluster, tmp_path, layout):
+    out = tmp_path / "out"
+    words = [*few.words(), *RAY, "--as", layout, "--out", str(out)]
+    process = start(words)
+    when(lambda: results(out, layout), process)
+    children = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    psutil.wait_procs(children, timeout=120)
+    before = results(out, layout)
+    assert before
+    answer = call(words)
+    assert answer.code == 0, answer.err
+    after = results(out, layout)
+    assert before.items() <= after.items() and len(after) > len(before)
+    check_whole(out, layout, few)
+
+
+@contextlib.contextmanager
+def small_disk(folder: Path, kilobytes: int) -> Iterator[Path]:
+    """A disk of its own, of this size."""
+    folder.mkdir()
+    size = f"size={kilobytes}k"
+    if os.geteuid() != 0 or subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", folder]).returncode:
+        pytest.skip("no file system can be mounted here")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+#: A folder is not begun with less than 8 MB free.
+@pytest.mark.parametrize(("layout", "kilobytes"), [("folders", 8 * 1024 + 400), ("parquet", 64)])
+def test_a_full_disk_ends_the_run_with_a_sentence_and_what_is_done_stays(
+    few, cluster, tmp_path, layout, kilobytes
+):
+    with small_disk(tmp_path / "disk", kilobytes) as disk:
+        words = [*few.words(), *RAY, "--as", layout, "--out", str(disk / "out")]
+        answer = call(words)
+        assert answer.code == 2 and "The disk of --out is full" in answer.err, answer.err
+        before = results(disk / "out", layout)
+        assert before and not list((disk / "out").glob(".part*"))
+        subprocess.run(["mount", "-o", "remount,size=64m", str(disk)], check=True)
+        answer = call(words)
+        assert answer.code == 0, answer.err
+        assert before.items() <= results(disk / "out", layout).items()
+        check_whole(disk / "out", layout, few)
+
+
+def test_a_dataset_of_bytes_and_matrices_gives_the_same_depth(few, cluster):
+    size = few.cameras
+    K = [[size["fx"], 0, size["cx"]], [0, size["fy"], size["cy"]], [0, 0, 1]]
+    E = np.eye(4)
+    E[0, 3] = size["baseline"]
+    camera = {"K_left": np.ravel(K).tolist(), "E": E.ravel().tolist(), "city": "Mainz"}
+
+    def images(key: str) -> dict[str, bytes]:
+        return {side: (few.folder / side / f"{key}.png").read_bytes() for side in ("left", "right")}
+
+    keys = ["000000", "000005"]
+    rows = [{"key": key, **images(key), **camera} for key in keys]
+    rows.append({"key": "torn", **images("000001"), **camera, "left": b"no image"})
+    rows.append({"key": "bare", **images("000001"), "city": "Mainz"})
+    how = {"steps": 1, "preset": "paper", "device": "cpu"}
+    with pytest.raises(InputError, match="an option must be one of"):
+        depth_dataset(ray.data.from_items(rows), tempo=3)
+    ds = ray.data.from_items(rows, override_num_blocks=len(rows))
+    made = {row["key"]: row for row in depth_dataset(ds, workers=Workers(1), **how).take_all()}
+    for key in keys:
+        millimetres = np.asarray(Image.open(io.BytesIO(made[key]["depth_mm"])))
+        np.testing.assert_array_equal(millimetres, depth_mm(np.load(few.one / key / "depth.npy")))
+        assert made[key]["city"] == "Mainz" and made[key]["error"] is None and "left" not in made[key]
+    assert "LEFT must be" in made["torn"]["error"] and "cameras are missing" in made["bare"]["error"]
+    for key in ("torn", "bare"):
+        assert all(made[key][name] is None for name in set(COLUMNS) - {"error"})
+
+
+def test_the_job_is_not_divided_twice(few, cluster, monkeypatch, tmp_path):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    answer = call([*few.words(), *RAY, "--out", str(tmp_path / "out")])
+    assert answer.code == 2 and "--engine ray divides the work by itself" in answer.err
+
+
+def test_cells_of_an_evaluation_are_those_of_one_process(cluster, tmp_path):
+    words = ["eval", "pairs", "demo", "--methods", "sgbm,guided", "--steps", "1", "-q"]
+    records = []
+    for engine in ([], RAY):
+        out = tmp_path / f"{len(records)}"
+        answer = call([*words, *engine, "--out", str(out)])
+        assert answer.code == 0, answer.err
+        lines = (out / "samples.jsonl").read_text().splitlines()
+        records.append({(r := json.loads(line))["key"]: r["raw"] for line in lines})
+    assert records[0] == records[1] and len(records[0]) == 2
+
+
+def test_options_of_a_pair_are_those_of_a_run_without_ray(few):
+    from geodiff_plugin.jobs.cluster import _alone
+
+    plain = DepthOptions(left=few.folder / "left", right=few.folder / "right", out=few.folder / "out")
+    assert _alone(replace(plain, engine="ray", layout="folders", workers=2, gpus=0.5)) == plain
