@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from diffusers.utils import BaseOutput
 
+from geodiff_plugin._reprojection import TargetCamera, depth_in_camera
 from geodiff_plugin.messages import Message
 
 #: Why a depth is not judged.
@@ -260,6 +261,38 @@ class MetricDepthOutput(BaseOutput):
         if not self.verdicts:
             raise AttributeError("This output has no verdict: no guided call made it.")
         return min(self.verdicts, key=lambda v: ("not trusted", "not judged", "trusted").index(v.status))
+
+    def into(self, K: np.ndarray, E: np.ndarray, size: tuple[int, int]) -> np.ndarray | torch.Tensor:
+        """The depth as another camera sees it: of an infrared pair in the colour camera, say.
+
+        Where several surfaces lie behind a pixel the nearest counts. Between the pixels of one surface, which
+        the prior makes dense, there are no holes; what the left camera does not see has no depth: 0.
+
+        Args:
+            K: ``(3, 3)`` pixels of that camera's image, without lens distortion.
+            E: ``(4, 4)`` pose of that camera in the left camera's frame, in the output's unit.
+            size: ``(width, height)`` of its image.
+
+        Returns:
+            Depth along z of that camera, shaped as ``prediction``: ``(N, height, width, 1)`` numpy or ``(N,
+            1, height, width)`` torch, float32.
+
+        Raises:
+            InputError: a K, E or size that is none.
+        """
+        camera = TargetCamera.checked(K, E, size)
+        if self.K is None:
+            raise AttributeError("This output has no K: no guided call made it.")
+        Ks = self.K if isinstance(self.K, np.ndarray) else self.K.numpy(force=True)
+        if isinstance(self.prediction, np.ndarray):
+            depths = self.prediction[..., 0]
+        else:
+            depths = self.prediction[:, 0].numpy(force=True)
+        pairs = zip(depths, Ks.astype(np.float64), strict=True)
+        seen = np.stack([depth_in_camera(depth, K_left, camera) for depth, K_left in pairs])
+        if isinstance(self.prediction, np.ndarray):
+            return seen[..., None]
+        return torch.from_numpy(seen[:, None]).to(self.prediction.device)
 
     def __repr__(self) -> str:
         """Sizes, range and verdict in a few lines, and no array."""

@@ -13,6 +13,7 @@ LAYER = {
     "_checks": 0,
     "_kernels": 0,
     "_lazy": 0,
+    "_reprojection": 0,
     "_signals": 0,
     "_strips": 0,
     "_threads": 0,

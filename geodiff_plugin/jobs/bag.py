@@ -11,12 +11,14 @@ import numpy as np
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats import recordings
 from geodiff_plugin.formats.out import check_new_file, write_text
+from geodiff_plugin.formats.target import frame_of_target, read_target_camera
 from geodiff_plugin.jobs.finished import Row
 from geodiff_plugin.jobs.many import depth_pairs
 from geodiff_plugin.jobs.options import PARAMETERS, DepthOptions
 from geodiff_plugin.jobs.pairs import start_many
 from geodiff_plugin.jobs.report import read_report
 from geodiff_plugin.jobs.telling import Tell, silent
+from geodiff_plugin.jobs.writing import INTO
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,8 @@ def depth_bag(options: DepthOptions, *, tell: Tell = silent, progress: bool = Fa
     """What ``geodiff depth`` does with a bag: its pairs into the folder ``NAME-frames``, then one bag.
 
     Args:
-        options: of the command; ``out`` is the bag to be written, ``depth.mcap`` by default.
+        options: of the command; ``out`` is the bag to be written, ``depth.mcap`` by default. Its images
+            are of the camera ``into``, if one is given.
         tell: takes the lines for the user.
         progress: whether a bar on stderr counts the pairs.
     """
@@ -52,12 +55,16 @@ def depth_bag(options: DepthOptions, *, tell: Tell = silent, progress: bool = Fa
     refs = start_many(options, tell)
     rows = depth_pairs(options, refs, tell=tell, progress=progress)
 
+    camera = None if options.into is None else read_target_camera(options.into)
+
     def results() -> Iterator[recordings.BagFrame]:
         for ref, (stamp, _) in zip(refs, pairs, strict=True):
             if report := read_report(frames / ref.name):
-                depth_m = np.load(frames / ref.name / "depth.npy", allow_pickle=False)
-                yield recordings.BagFrame(stamp, depth_m, np.reshape(report["K"], (3, 3)))
+                file, K = ("depth.npy", report["K"]) if camera is None else (INTO[0], camera.K)
+                depth_m = np.load(frames / ref.name / file, allow_pickle=False)
+                yield recordings.BagFrame(stamp, depth_m, np.reshape(K, (3, 3)))
 
+    frame_id = frame_id if options.into is None else frame_of_target(options.into)
     count = recordings.write_depth_bag(out, results(), frame_id, options.encoding)
     return BagResult(out, frames, count, rows)
 

@@ -158,6 +158,11 @@ class DepthOptions(RunOptions):
     min_confidence: float = _output(
         0.0, "Leave points of lower confidence out of the cloud, 0 to 1.", low=0, high=1
     )
+    into: Path | None = _output(
+        None,
+        "Also write the depth as another camera sees it: a JSON file with its K, its pose E in the left "
+        "camera's frame, width and height.",
+    )
     out: Path | None = _output(
         None, "Output folder (default: geodiff-out, with a number if that exists).", "--out", "-o"
     )
@@ -369,6 +374,10 @@ def check_files(options: DepthOptions, photographs: bool = True) -> None:
         model = any(os.path.exists(path / file) for file in (*MODEL_FILES, "images.bin"))
         if not (name == "calibration" and model):  # missing files of a model are reported when it is read
             check_file(path, name)
+    if options.into is not None:
+        from geodiff_plugin.formats.target import read_target_camera  # imports numpy
+
+        read_target_camera(options.into)
 
 
 def with_folder(options: DepthOptions, default: str) -> DepthOptions:

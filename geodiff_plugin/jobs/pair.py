@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from geodiff_plugin._checks import warn
@@ -15,9 +16,9 @@ from geodiff_plugin.jobs.options import DepthOptions, start_pair, with_folder
 from geodiff_plugin.jobs.prior import prior_of_options
 from geodiff_plugin.jobs.reading import PairInputs, read_pair
 from geodiff_plugin.jobs.records import JobLog, PairResult, PairRun
-from geodiff_plugin.jobs.report import build_report, report_text
+from geodiff_plugin.jobs.report import build_report, report_text, single_map
 from geodiff_plugin.jobs.telling import Tell, silent
-from geodiff_plugin.jobs.writing import write_exports, write_maps, write_undistorted
+from geodiff_plugin.jobs.writing import write_exports, write_into, write_maps, write_undistorted
 from geodiff_plugin.runtime.machine import pick_device
 
 
@@ -81,6 +82,9 @@ def write_pair(folder: OutFolder, run: PairRun, **entries: Any) -> PairResult:
             report["files"] = write_maps(place, output, inputs.left, options.min_confidence)
             if inputs.undistorted:
                 write_undistorted(place, inputs.left)
+            if options.into is not None:
+                depth_m, K = single_map(output.prediction), np.asarray(output.K)[0].astype(np.float64)
+                report["into"] = write_into(place, depth_m, K, options.into)
             if options.export:
                 write_exports(place, output, inputs, options)
         report["files"]["names"] = [*sorted(path.name for path in place.iterdir()), REPORT]

@@ -17,6 +17,7 @@ from geodiff_plugin.jobs.pairs import PairRef, options_of
 from geodiff_plugin.jobs.reading import read_pair
 from geodiff_plugin.jobs.report import read_report
 from geodiff_plugin.jobs.telling import Tell, silent
+from geodiff_plugin.jobs.writing import write_into
 
 #: Scenes of which the beginning is told.
 MOST_SCENES = 9
@@ -51,6 +52,9 @@ def write_steady_frames(
         with warnings.catch_warnings(action="ignore"):  # the run of the pair has warned
             scenes = write_steady(known, picture)
         for i, scene in enumerate(scenes):
+            if options.into is not None:
+                depth = np.load(folders[i] / "depth.npy")
+                reports[i]["into"] = write_into(folders[i], depth, known[i][1], options.into)
             note(i, [f"{name}.npy" for name in AGREED], steady={"scene": scene})
     except OSError as error:
         raise InputError(f"--steady ended ({reason_of(error)}); the same command resumes.") from error

@@ -9,11 +9,16 @@ import numpy as np
 from PIL import Image
 
 from geodiff_plugin import formats, plotting
+from geodiff_plugin._reprojection import depth_in_camera
 from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.formats.target import read_target_camera
 from geodiff_plugin.jobs.options import DepthOptions, unique_names
 from geodiff_plugin.jobs.reading import PairInputs
 from geodiff_plugin.jobs.report import single_map, used_poses
 from geodiff_plugin.types import MetricDepthOutput
+
+#: Depth as the camera of ``--into`` sees it: floats, and whole millimetres.
+INTO = ("depth_into.npy", "depth_into_mm.png")
 
 
 def write_maps(
@@ -46,6 +51,16 @@ def write_maps(
         "flying_points": int(flying.sum()),
         "doubtful_points": int(doubtful.sum()),
     }
+
+
+def write_into(folder: Path, depth_m: np.ndarray, K: np.ndarray, path: Path) -> dict[str, Any]:
+    """Write a depth map ``(H, W)`` as the camera of ``--into`` sees it; what the report says of it."""
+    camera = read_target_camera(path)
+    seen_m = depth_in_camera(depth_m, K, camera)
+    formats.write_depth_npy(folder / INTO[0], seen_m)
+    formats.write_depth_mm(folder / INTO[1], seen_m)
+    known = round(float((seen_m > 0).mean()), 4)
+    return {"K": camera.K.tolist(), "E": camera.E.tolist(), "size": list(camera.size), "known_share": known}
 
 
 def write_undistorted(folder: Path, image_01: np.ndarray, number: int = 1) -> str:
