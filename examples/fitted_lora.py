@@ -28,8 +28,10 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.bundled.demo_pair import DemoPair, read_demo_pair
 from geodiff_plugin.priors.marigold_v2 import MarigoldV2Pipeline
 
-#: Metres that the authors clamp to.
-NEAREST_M, FARTHEST_M = 1e-3, 1000.0
+#: Least metres that the authors clamp to.
+NEAREST_M = 1e-3
+#: Most metres, likewise.
+FARTHEST_M = 1000.0
 #: Layers of a block that carry the checkpoint's LoRA, and so this one.
 TARGETS = re.compile(
     r"transformer_blocks\.(\d+)\.(attn\.(to_[qkv]|to_out\.0|add_[qkv]_proj|to_add_out)"

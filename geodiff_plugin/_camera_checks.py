@@ -9,11 +9,16 @@ import numpy as np
 from geodiff_plugin._checks import bad_type, bad_value, refuse, warn
 from geodiff_plugin.messages import Message
 
-#: A longer baseline, or known depths all of which are further, may be in millimetres.
-LONG_BASELINE_M, FAR_POINTS_M = 20.0, 100.0
-#: A principal point in the outer fifth of an image is rather that of an image of another size; so is one this
-#: far off the middle, in shares of the image, by nearly the same share both ways: few crops move both alike.
-NEAR_BORDER, OFF_MIDDLE, NEARLY_ALIKE = 0.2, 0.12, 0.08
+#: A longer baseline may be in millimetres.
+LONG_BASELINE_M = 20.0
+#: Known depths may be in millimetres if all of them are further than this.
+FAR_POINTS_M = 100.0
+#: A principal point this close to the border, as a share of the image, is rather that of another size.
+NEAR_BORDER = 0.2
+#: So is one that is this share of the image off the middle, in both directions, by nearly the same share.
+OFF_MIDDLE = 0.12
+#: The shares are nearly the same if they differ by less than this: few crops move both alike.
+NEARLY_ALIKE = 0.08
 #: Pixels are about square; a stretched image has them up to 16:9, and a mistyped digit beyond.
 STRETCHED = 2.0
 #: Focal length over width below which a lens without distortion would see more than 150 degrees.

@@ -16,8 +16,10 @@ from kornia.geometry.depth import unproject_meshgrid
 from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
-#: Two cameras count as rectified to a milliradian, and to a baseline that is sideways to 1 %.
-ANGLE_TOLERANCE, SIDEWAYS_TOLERANCE = 1e-3, 0.01
+#: Two cameras count as rectified if they are parallel to within so many radians.
+ANGLE_TOLERANCE = 1e-3
+#: Their baseline may leave the sideways direction by this share of its length.
+SIDEWAYS_TOLERANCE = 0.01
 #: ``(4, 4)``, from a camera's frame with y down and z forward to one with y up and z backward, and back.
 #: OpenGL, Blender, NeRF and glTF use the latter. kornia's ``camtoworld_graphics_to_vision_4x4`` turns the
 #: axes of a pose in the world; a relative pose needs both sides.

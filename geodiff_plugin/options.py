@@ -18,7 +18,10 @@ from geodiff_plugin._checks import bad_value, check_choice, check_number, check_
 if TYPE_CHECKING:
     from geodiff_plugin.config import GuidanceConfig
 
-CAMERAS, RUN, OUTPUT = "Cameras", "Prior and run", "Output"
+# Titles of the groups of options in ``--help``.
+CAMERAS = "Cameras"
+RUN = "Prior and run"
+OUTPUT = "Output"
 DTYPES = ("float32", "float16", "bfloat16")
 #: Keys of ``scale.space.SPACES``, which cannot be imported without torch; a test keeps them the same.
 SPACES = ("depth", "disparity", "log", "log1p", "sqrt_disparity")

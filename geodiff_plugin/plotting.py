@@ -21,8 +21,10 @@ from geodiff_plugin.formats.out import atomic_path, reason_of
 
 #: ``(H, W)``, of a picture ``(H, W, 3)``.
 Map = np.ndarray
-#: Lightness grows evenly in both, so equal steps look equal; neither has a colour near the grey of "unknown".
-DEPTH_COLOURS, SHARE_COLOURS = "plasma", "YlGnBu_r"
+#: Colours of depth. Lightness grows evenly, so equal steps look equal; none is near the grey of "unknown".
+DEPTH_COLOURS = "plasma"
+#: Colours of shares and probabilities, likewise, and not to be taken for depth.
+SHARE_COLOURS = "YlGnBu_r"
 GREY = 128
 #: Share of the pixels beyond either end of the colours, so that one outlier does not flatten the rest.
 TAIL_PERCENT = 2.0

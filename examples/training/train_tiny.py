@@ -27,8 +27,10 @@ __all__ = ["build_tiny", "distillation_loss", "draw_maps", "main", "perturbed", 
 
 #: Weight of the latents' squared error beside that of maps.
 _CODE = 0.2
-#: Of the latents this share is blurred, and all get noise of up to this standard deviation.
-_BLURRED, _NOISE = 0.5, 0.2
+#: Share of the latents that is blurred.
+_BLURRED = 0.5
+#: Largest standard deviation of the noise that all of them get.
+_NOISE = 0.2
 #: Side of a crop, pixels.
 _SIDE = 64
 _SAY_EVERY = 500

@@ -18,19 +18,29 @@ from torch import Tensor
 from geodiff_plugin.algorithm import solver
 from geodiff_plugin.algorithm.solver import FieldSystem
 
-#: Pixels of a tile and warps of a program, of grids of many tiles.
-TILE, WARPS = 512, 8
-#: The same for grids of one tile, which a program solves by itself.
-SINGLE_TILE, SINGLE_WARPS = 1024, 8
+#: Pixels of a tile, of grids of many tiles.
+TILE = 512
+#: Warps of a program that solves one of them.
+WARPS = 8
+#: Pixels of the one tile of a grid that a program solves by itself.
+SINGLE_TILE = 1024
+#: Warps of that program.
+SINGLE_WARPS = 8
 #: Registers of a thread at most, and programs that a multiprocessor of 65,536 registers then holds.
 MOST_REGISTERS = 80
 RESIDENT = 65_536 // (MOST_REGISTERS * 32 * WARPS)
 #: Registers of a thread at most, of the one program that solves a grid by itself.
 SINGLE_REGISTERS = 168
-#: Where the first iterate comes from: zeros, a field of the same grid, a field of the next coarser grid.
-FROM_ZEROS, FROM_FIELD, FROM_COARSER = 0, 1, 2
-#: Arrays of a field's size, and sums a tile, that the kernel works with.
-WORK_ARRAYS, SUMS = 6, 3
+#: The first iterate is zero.
+FROM_ZEROS = 0
+#: It is a field of the same grid.
+FROM_FIELD = 1
+#: It is a field of the next coarser grid.
+FROM_COARSER = 2
+#: Arrays of a field's size that the kernel works with.
+WORK_ARRAYS = 6
+#: Sums that it keeps of every tile.
+SUMS = 3
 #: A counter a row of so many numbers, whose address is aligned then, and compiled for once.
 ALIGNED = 4
 #: Partial sums that are added at a time.

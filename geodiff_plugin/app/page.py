@@ -32,9 +32,20 @@ from geodiff_plugin.messages import distinct
 
 #: A visitor's uploads, result and files are deleted after this long, and when the tab is closed.
 FORGET_AFTER_S = 600
-#: Least confidence of points; view of the cloud: degrees around, from above, distance over its depth.
-LEAST_CONFIDENCE, VIEW_ANGLES, VIEW_FROM = 0.5, (90, 75), 1.05
-CLOUD_TAB, FILES_TAB, PANEL_HEIGHT, NIGHT = "Point cloud", "Downloads", 560, (0.09, 0.1, 0.12, 1.0)
+#: The cloud shows points that are at least this likely to be right.
+LEAST_CONFIDENCE = 0.5
+#: The cloud is first seen from these angles, in degrees: around it, and down from straight above.
+VIEW_ANGLES = (90, 75)
+#: It is seen from this distance, as a multiple of its depth, which shows the whole of it.
+VIEW_FROM = 1.05
+#: Title of the tab whose cloud is made when it is opened.
+CLOUD_TAB = "Point cloud"
+#: Title of the tab whose files are written when it is opened.
+FILES_TAB = "Downloads"
+#: Pixels, the same for pictures and cloud, so that nothing jumps from tab to tab.
+PANEL_HEIGHT = 560
+#: Background of the cloud, as red, green, blue and opacity: colours show best on near black.
+NIGHT = (0.09, 0.1, 0.12, 1.0)
 THEME = gr.themes.Base(
     primary_hue="teal",
     neutral_hue="slate",

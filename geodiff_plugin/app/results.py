@@ -28,12 +28,19 @@ LARGEST_SIDE = 1600
 MOST_POINTS_SHOWN = 250_000
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 LEGEND_STOPS = 24
-EVERYTHING, MEASUREMENTS, SCENE = "everything.zip", "measurements.csv", "scene.glb"
+#: Name of the archive of all files.
+EVERYTHING = "everything.zip"
+#: Name of the table of what the visitor measured.
+MEASUREMENTS = "measurements.csv"
+#: Name of the cloud that the page shows.
+SCENE = "scene.glb"
 MARK = "#c2410c"
 #: ``confidence`` is the probability that a depth is within this share of the truth.
 CONFIDENT_WITHIN = 0.1
-#: Confidences beyond these say no more about the spread than these do.
-LEAST_CONFIDENCE, MOST_CONFIDENCE = 0.05, 0.999
+#: A lower confidence says no more about the spread than this one does.
+LEAST_CONFIDENCE = 0.05
+#: Nor does a higher one than this.
+MOST_CONFIDENCE = 0.999
 #: From the median absolute deviation to the standard deviation of a normal distribution.
 SD_OF_MAD = 1.4826
 Pixels = list[tuple[int, int]]

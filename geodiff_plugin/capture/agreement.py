@@ -24,14 +24,18 @@ LEAST_WEIGHT = 0.05
 RISES = 0.4
 #: So many other frames must agree with each other to replace a depth that none of them confirms.
 OUTVOTES = 2
-#: Side and rounds of the median that smooths depth around what others replace.
-SMOOTHED, ROUNDS = 5, 3
+#: Side in pixels of the median that smooths depth around what others replace; OpenCV's largest for floats.
+SMOOTHED = 5
+#: Times that it is taken, one after the other.
+ROUNDS = 3
 #: Frames before and after a frame of a video that it is checked against.
 STEADY = 3
 #: Confidence from which others do not outvote what may have moved.
 SURE = 0.8
-#: The motion of a camera is known if so many matches fit it, to within so many pixels of the shrunk pictures.
-LEAST_INLIERS, INLIER_PX = 20, 1.5
+#: The motion of a camera is known if so many matches fit it.
+LEAST_INLIERS = 20
+#: A match fits to within so many pixels of the shrunk pictures.
+INLIER_PX = 1.5
 
 
 class SeenIn(NamedTuple):

@@ -26,10 +26,16 @@ from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.multiview import SolvedCapture, solve_capture
 from geodiff_plugin.types import MetricDepthOutput
 
-#: A solve that moved the given poses, or estimated them; its points count from this many frames on.
-ADJUSTED, FEWEST_FRAMES = ("solved", "estimated"), 3
-#: Angle of two rays that a match is worth most at, degrees, and how fast it is worth less below and above it.
-BEST_ANGLE_DEG, NARROWER_DEG, WIDER_DEG = 6.0, 2.5, 10.0
+#: What a solve is called that moved the given poses, or estimated them.
+ADJUSTED = ("solved", "estimated")
+#: Its points count as known depths if so many frames see them: two rays alone do not contradict each other.
+FEWEST_FRAMES = 3
+#: Angle of two rays, degrees, at which a match is worth most.
+BEST_ANGLE_DEG = 6.0
+#: How fast it is worth less below that angle, degrees: depth becomes inexact.
+NARROWER_DEG = 2.5
+#: How fast it is worth less above it, degrees: the views look different.
+WIDER_DEG = 10.0
 #: A point that a chosen neighbour sees already counts so much for the next one.
 SEEN_AGAIN = 0.5
 #: A neighbour must be worth this share of the best one.

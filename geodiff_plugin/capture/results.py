@@ -30,16 +30,28 @@ ALONE = ("depth_alone", "confidence_alone")
 AGREED = ("depth", "confidence", "confirmed", "asked")
 #: Pictures of the depth that agreement makes anew.
 FIGURES = ("depth_mm.png", "depth.png")
-#: Frames that a frame is checked against, frames on the contact sheet, points of the GLB.
-OTHERS, ON_SHEET, GLB_POINTS = 6, 24, 400_000
-#: Pixels of the video, whose frames are a photograph and its depth side by side, and frames a second.
-VIDEO_SIZE, VIDEO_FPS = (1280, 480), 5.0
-#: Points closer than this share of the median depth are one; points of lower confidence are left out.
-CELL_SHARE, LEAST_CONFIDENCE = 0.004, 0.5
+#: Frames that a frame is checked against.
+OTHERS = 6
+#: Frames on the contact sheet.
+ON_SHEET = 24
+#: Points of the GLB at most, few enough for a viewer in a browser.
+GLB_POINTS = 400_000
+#: Pixels of the video, whose frames are a photograph and its depth side by side.
+VIDEO_SIZE = (1280, 480)
+#: Frames a second, slow enough to look at each.
+VIDEO_FPS = 5.0
+#: Points closer than this share of the median depth are one.
+CELL_SHARE = 0.004
+#: Points of lower confidence are left out of the cloud.
+LEAST_CONFIDENCE = 0.5
 #: Points of one frame at most; more would not show in a cloud of many frames.
 MOST_POINTS = 200_000
-#: A voxel of the mesh as a share of the median depth; voxels along a block's side; blocks to begin with.
-MESH_SHARE, BLOCK, BLOCKS = 0.004, 16, 10_000
+#: A voxel of the mesh, as a share of the median depth.
+MESH_SHARE = 0.004
+#: Voxels along a block's side, Open3D's usual number.
+BLOCK = 16
+#: Blocks to begin with; Open3D makes room for more.
+BLOCKS = 10_000
 #: Frames after which their points are merged, so that a long capture fits the memory.
 MERGED_AFTER = 20
 #: Columns of the cloud.

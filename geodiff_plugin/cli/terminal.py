@@ -10,7 +10,14 @@ if TYPE_CHECKING:  # drawn by few commands
     from rich.console import RenderableType
     from rich.table import Table
 
-EXIT_BAD_INPUT, EXIT_SOME_FAILED, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 4, 130, 143
+#: Exit status of a command whose input is refused, as of one with a wrong option.
+EXIT_BAD_INPUT = 2
+#: Of a run some of whose pairs or frames failed, while the others are written.
+EXIT_SOME_FAILED = 4
+#: Of an interrupted run: 128 and the number of the signal, as shells have it.
+EXIT_INTERRUPTED = 130
+#: Likewise of a run that was asked to end.
+EXIT_TERMINATED = 143
 #: Characters a line may have where nobody's terminal bounds it.
 UNBOUNDED = 10_000
 

@@ -35,8 +35,10 @@ from geodiff_plugin.formats.transforms import read_transforms
 from geodiff_plugin.formats.unknown import refuse_foreign, refuse_unknown
 from geodiff_plugin.messages import Message
 
-#: Names and reasons that a note gives of frames that are left out.
-MOST_NAMES, MOST_REASONS = 5, 3
+#: A note names so many of the frames that are left out, at most.
+MOST_NAMES = 5
+#: It gives so many of their reasons, at most.
+MOST_REASONS = 3
 
 #: Every layout; the first that recognises a path reads it.
 LAYOUTS = (

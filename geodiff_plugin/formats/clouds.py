@@ -26,8 +26,10 @@ if TYPE_CHECKING:
 RELATIVE_STEP = 0.04
 #: A corner of a flat surface has three neighbours on it, a one-pixel ramp along an edge has two.
 FEWEST_NEIGHBOURS = 3
-#: Upper bounds on the points of a mesh, and of a cloud as GLB; larger ones are thinned.
-MESH_POINTS, GLB_POINTS = 300_000, 2_000_000
+#: Upper bound on the points of a mesh; a larger one is thinned.
+MESH_POINTS = 300_000
+#: Upper bound on the points of a cloud as GLB, likewise.
+GLB_POINTS = 2_000_000
 PYRAMID_SHARE = 0.08  # of the cloud's median depth
 CAMERA_COLOURS = ((255, 255, 255), (255, 170, 0), (0, 200, 255), (160, 255, 120))
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])

@@ -78,7 +78,10 @@ CAMERA = re.compile(r"^[ \t]*(\d+)[ \t]+([A-Z_]+)[ \t]+(\d+)[ \t]+(\d+)[ \t]+(\S
 IMAGE = re.compile(
     r"^[ \t]*(\d+)((?:[ \t]+[-+.\deE]+){7})[ \t]+(\d+)[ \t]+(?![-+.\deE]+[ \t]+\S)(\S.*)$", re.MULTILINE
 )
-CAMERAS_MARK, IMAGES_MARK = "# Camera list with", "# Image list with"
+#: How COLMAP begins a file of cameras.
+CAMERAS_MARK = "# Camera list with"
+#: How it begins a file of images.
+IMAGES_MARK = "# Image list with"
 _ANY_CAMERA = rf"^[ \t]*\d+[ \t]+(?:{'|'.join(MODELS)})[ \t]+\d+[ \t]+\d+[ \t]+\S"
 MARK = rf"{CAMERAS_MARK}|{IMAGES_MARK}|{_ANY_CAMERA}|{IMAGE.pattern}"
 LONGEST_HEAD = 200
@@ -94,8 +97,10 @@ PLACES = (
 Files = tuple[Path, Path]
 #: A start for other programs: text of a million points is 50 MB.
 MOST_POINTS = 100_000
-#: Points that fewer images see, or that lie further off in pixels, are no known depths.
-FEWEST_VIEWS, MOST_ERROR_PX = 3, 1.5
+#: Points that fewer images see are no known depths.
+FEWEST_VIEWS = 3
+#: Nor are points that lie further off in the images, pixels.
+MOST_ERROR_PX = 1.5
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,12 @@ from geodiff_plugin.formats.out import atomic_path
 if TYPE_CHECKING:  # which imports torch
     from geodiff_plugin.types import Rig
 
-LARGEST_MM, MILLIMETRES, KITTI_UNITS = 65535, 1000.0, 256.0
+#: The largest value of 16 bits; cameras write it where they know nothing.
+LARGEST_MM = 65535
+#: Units of a metre in a depth map of whole numbers.
+MILLIMETRES = 1000.0
+#: Units of a metre, or of a pixel of disparity, in a PNG of KITTI.
+KITTI_UNITS = 256.0
 #: Disparities of which this share is negative have another sign.
 MOST_NEGATIVE = 0.5
 #: Maps of these are 0 where unknown.

@@ -24,7 +24,8 @@ from geodiff_plugin.formats.rigs import (
 )
 from geodiff_plugin.types import Rig
 
-MM_PER_METRE, CM_PER_METRE = 1000.0, 100.0
+MM_PER_METRE = 1000.0
+CM_PER_METRE = 100.0
 ZED_SIZES = {
     **{"4K": (3840, 2160), "QHDPLUS": (3200, 1800), "2K": (2208, 1242), "FHD1200": (1920, 1200)},
     **{"FHD": (1920, 1080), "HD": (1280, 720), "SVGA": (960, 600), "VGA": (672, 376)},

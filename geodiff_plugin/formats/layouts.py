@@ -18,7 +18,10 @@ from geodiff_plugin.types import Distortion
 IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic")
 #: Folders beside a file of cameras in which its images lie, smaller copies last.
 IMAGE_FOLDERS = ("images", "input", "images_2", "images_4", "images_8")
-NO_IMAGE, NO_POSE = "no image file", "no pose"
+#: Why a frame without its photograph is left out.
+NO_IMAGE = "no image file"
+#: Why a frame that was not placed is left out.
+NO_POSE = "no pose"
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,12 @@ try:
 except ImportError:  # Windows: two runs with one folder are not detected
     fcntl = None  # type: ignore[assignment]
 
-PARTIAL, LOCK, FILES = ".geodiff-partial", "lock", "files"
+#: Folder in which results are written before they take their place, as a whole.
+PARTIAL = ".geodiff-partial"
+#: Its file that a run locks, so that no other takes the folder.
+LOCK = "lock"
+#: Its folder of what has been written so far.
+FILES = "files"
 #: The lock of a folder that a run works in for long, in full view of other runs.
 FOLDER_LOCK = ".geodiff-lock"
 REPORT = "report.json"

@@ -23,7 +23,8 @@ from geodiff_plugin.formats.storage import read_storage
 from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Rig
 
-MM_PER_METRE, CM_PER_METRE = 1000.0, 100.0
+MM_PER_METRE = 1000.0
+CM_PER_METRE = 100.0
 ENTRY = re.compile(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*?)[ \t]*$", re.MULTILINE)
 #: Files are printed with three decimals, so an honest cam1 agrees with doffs better than this.
 DOFFS_TOLERANCE_PX = 0.05

@@ -12,8 +12,10 @@ from typing import NoReturn
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.layouts import CaptureFormat
 
-#: Files of a folder that are looked at, kinds of them that a message gives.
-MOST_FILES, MOST_KINDS = 2000, 6
+#: Files of a folder that are looked at: listing a whole disk takes long.
+MOST_FILES = 2000
+#: Kinds of files that a message gives.
+MOST_KINDS = 6
 
 
 @dataclass(frozen=True)

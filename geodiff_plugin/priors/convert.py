@@ -49,12 +49,20 @@ VAE_ID = "stable-diffusion-v1-5/stable-diffusion-v1-5"
 #: What diffusers' conversion expects before every name.
 LDM_PREFIX = "model.diffusion_model."
 
-#: Of ``ppd.pth``: its transformer, and the encoder whose tokens that takes, as transformers has it.
-TRANSFORMER, ENCODER_ID = "dit.", "depth-anything/Depth-Anything-V2-Large-hf"
+#: How the names of the transformer's weights begin in ``ppd.pth``.
+TRANSFORMER = "dit."
+#: The encoder whose tokens it takes, as transformers has it.
+ENCODER_ID = "depth-anything/Depth-Anything-V2-Large-hf"
 SIZES = ("hidden_size", "num_hidden_layers", "num_attention_heads", "mlp_ratio", "image_size", "patch_size")
 
-MARIGOLD_V2, TRAINABLES = "marigold-v2", "trainables.safetensors"
-PROMPT_FOLDER, PROMPT = "qwen_text_embeddings", "qwen_edit_2509_qwen_depth_realimg512"
+#: Name of the prior that ``TRAINABLES`` belong to.
+MARIGOLD_V2 = "marigold-v2"
+#: Its authors' file of the weights that they trained.
+TRAINABLES = "trainables.safetensors"
+#: Their folder of encoded prompts.
+PROMPT_FOLDER = "qwen_text_embeddings"
+#: The prompt for depth in that folder.
+PROMPT = "qwen_edit_2509_qwen_depth_realimg512"
 INDEX = "diffusion_pytorch_model.safetensors.index.json"
 #: What loads the parts that are written, but for the space; they are never in memory together.
 INDEX_OF_PRIOR: dict[str, Any] = {

@@ -17,8 +17,10 @@ from geodiff_plugin.priors.loading import Layout, build_pipeline, load_component
 from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Generators, stretched
 
 DOMAINS = ("indoor", "outdoor", "object")
-#: Width of the class embedding -> further condition of the U-Net: the image in v1, the domain as text in v2.
-IMAGE_EMBEDDING, TEXT_PROMPT = 10, 4
+#: Width of the class embedding of a U-Net whose further condition is the image (v1).
+IMAGE_EMBEDDING = 10
+#: The same of one whose further condition is the domain as text (v2).
+TEXT_PROMPT = 4
 #: The authors' subfolder of the second version.
 UNET_V2 = "unet_v2"
 #: Added to the length of a decoded normal before dividing by it.

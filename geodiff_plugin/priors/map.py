@@ -23,8 +23,10 @@ from geodiff_plugin.priors.transformers_depth import range_of
 
 #: What ``load_prior("map")`` loads: no folder is there, and none is needed.
 MAP_LAYOUT = Layout(Path(__file__).with_suffix(""), "map")
-#: Weight of a known pixel against its links in the fill of holes, and conjugate-gradient steps per grid.
-FIRM, FILL_STEPS = 100.0, 20
+#: Weight of a known pixel against its links to its neighbours, where holes are filled.
+FIRM = 100.0
+#: Conjugate-gradient steps of the fill, for every grid of the pyramid.
+FILL_STEPS = 20
 #: Where a resized map mixes in less than this of a hole, its value is the map's.
 ALL_KNOWN = 0.999
 #: Image pixels to a pixel of the map from which its edges are made steep again after enlargement.

@@ -20,8 +20,10 @@ from geodiff_plugin.priors.pipeline import Condition, DepthDiffusionPipeline, Ge
 SPACE_OF_CHECKPOINT = {"log": "log", "uniform": "depth", "disparity": "disparity"}
 #: Timestep input of the network, of 1000. The authors write 499 / 1000 in bfloat16, where 499 is 500.
 TIMESTEP = 500.0
-#: One token is a square of this side, one latent a cell of half of it.
-SIDE, CELL = 16, 8
+#: Pixels along the side of the square of one token.
+SIDE = 16
+#: Pixels along the side of the cell of one latent.
+CELL = 8
 
 
 def _statistics(vae: AutoencoderKLQwenImage, like: Tensor) -> tuple[Tensor, Tensor]:

@@ -25,9 +25,16 @@ SIDE = 16
 LAST_TIMESTEP = 1000
 #: Shorter over longer side of the training images: 1024 x 768.
 TRAINING_RATIO = 0.75
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-#: Base of the rotary embedding, size of that of the time, and what keeps norms from 0.
-ROPE_BASE, TIME_FREQUENCIES, NORM_EPS = 100.0, 256, 1e-6
+#: Mean of red, green and blue in ImageNet, which the encoder subtracts.
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+#: Their standard deviation, by which it divides.
+IMAGENET_STD = (0.229, 0.224, 0.225)
+#: Base of the rotary embedding.
+ROPE_BASE = 100.0
+#: Size of the embedding of the time.
+TIME_FREQUENCIES = 256
+#: Keeps norms from 0.
+NORM_EPS = 1e-6
 #: DINOv2 stretches its position embeddings by (n + 0.1) / old and not by n / old.
 POSITION_OFFSET = 0.1
 

@@ -16,8 +16,10 @@ from geodiff_plugin.priors.loading import Layout, build_pipeline, load_component
 from geodiff_plugin.priors.pipeline import Condition, DirectMapPipeline, Generators
 
 MODES = {2: "bilinear", 3: "bicubic"}  # of PIL
-#: Whose library resizes without antialiasing, or pads after normalising.
-ALIASED, PADDED_LAST = ("ZoeDepth", "DepthPro"), ("DPT", "PromptDepthAnything")
+#: Whose library resizes without antialiasing.
+ALIASED = ("ZoeDepth", "DepthPro")
+#: Whose library pads after normalising.
+PADDED_LAST = ("DPT", "PromptDepthAnything")
 #: Whose library brings the map to the image's size bilinearly; the others' do so bicubically.
 BILINEAR = ("DepthPro", "Tipsv2Dpt")
 HALF = (0.5, 0.5, 0.5)
@@ -138,12 +140,16 @@ PROMPTED = "PromptDepthAnythingForDepthEstimation"
 SPACES = ("depth", "disparity")
 #: Weights that DPT's published files lack and no forward reads: the first fusion has nothing to add to.
 UNREAD = "fusion_stage.layers.0.residual_layer1."
-#: DepthPro's own limits on inverse metres.
-NEAREST, FARTHEST = 1e4, 1e-4
+#: DepthPro's own upper limit on inverse metres.
+NEAREST = 1e4
+#: Its lower limit.
+FARTHEST = 1e-4
 #: What is 1; a few stray pixels shall not press the rest together.
 TOP_QUANTILE = 0.98
-#: Metres; a network's least depth may be 0, and so may the span of a prompt.
-NEAREST_M, LEAST_SPAN_M = 1e-3, 1e-6
+#: Least metres of a network's range, whose nearest depth may be 0.
+NEAREST_M = 1e-3
+#: Least metres between the nearest and the farthest depth of a prompt, which may all be one.
+LEAST_SPAN_M = 1e-6
 PREPARATION_FILES = ("preprocessor_config.json", "processor_config.json")
 
 

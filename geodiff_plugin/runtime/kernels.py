@@ -12,8 +12,10 @@ from torch import Tensor
 
 #: Values that a program holds at once.
 BLOCK = 2048
-#: Programs of a group at most, whose sums each of them adds up; and programs that keep a large card busy.
-MOST_PARTS, BUSY = 64, 2048
+#: Programs of a group at most, because each of them adds up the sums of all.
+MOST_PARTS = 64
+#: Programs that keep a large card busy.
+BUSY = 2048
 
 
 @triton.jit(do_not_specialize=["length", "part", "parts"])

@@ -16,10 +16,14 @@ from geodiff_plugin.scale.points import KERNEL_FORMS
 _LEAST_BLOCK = 1024
 #: Matches whose equations are summed at once, fewer than are searched for their median.
 CHUNK = 512
-#: Matches for a warp, and the most warps.
-_MATCHES_A_WARP, _MOST_WARPS = 256, 32
-#: The bits of 1.0, the largest residual, as an integer, and the halvings that find one of so many numbers.
-_BITS_OF_ONE, _HALVINGS = tl.constexpr(0x3F800000), tl.constexpr(31)
+#: Matches for a warp.
+_MATCHES_A_WARP = 256
+#: Warps of a program at most.
+_MOST_WARPS = 32
+#: The bits of 1.0, the largest residual, as an integer.
+_BITS_OF_ONE = tl.constexpr(0x3F800000)
+#: Halvings that find one of so many numbers.
+_HALVINGS = tl.constexpr(31)
 
 
 @triton.jit

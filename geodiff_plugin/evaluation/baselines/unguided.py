@@ -51,8 +51,10 @@ def sweep(sample: StereoSample, device: str, views: int = 2) -> CostVolume:
 MAX_SHIFT = 0.25
 #: Matches with a smaller shift than this, in pixels, are taken for mistakes, which cost most, and filled.
 MIN_SHIFT_PX = 1.0
-#: As OpenCV's example sets its filter.
-WLS_LAMBDA, WLS_SIGMA = 8000.0, 1.5
+#: Smoothness of the filter, as OpenCV's example sets it.
+WLS_LAMBDA = 8000.0
+#: Its sensitivity to edges of the image, likewise.
+WLS_SIGMA = 1.5
 
 
 def sgbm_shift(sample: StereoSample, wls: bool = False) -> np.ndarray:
