@@ -144,7 +144,7 @@ MUTANTS = [
         ("FIT_CAUCHY = 2.0", "FIT_CAUCHY = 4.0"),
         ("FIT_NOISE = 0.5", "FIT_NOISE = 1.0"),
         ("nearness = -values if", "nearness = values if"),
-        ("confidence, doubt.sqrt()]", "confidence, doubt]"),
+        ("confidence, doubt.sqrt(),", "confidence, doubt,"),
         ("NEAR_REACH = 1.4", "NEAR_REACH = 0.7"),
         ("share * below[:, -1:]", "0.5 * below[:, -1:]"),
     ),

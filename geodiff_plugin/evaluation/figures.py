@@ -35,12 +35,17 @@ from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, gri
 from geodiff_plugin.scale.space import SPACES, smooth_floor
 from geodiff_plugin.types import DepthFrame
 
-#: A picture or a figure of matplotlib, and what it shows as JSON values.
-Drawing = tuple[Any, dict[str, Any]]
 #: Colours of lines, in order (Okabe and Ito's, distinguishable for the colour-blind), and their markers.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MARKERS = "osD^vP"
 PRESETS = ("guided", "paper")
+
+
+class Drawing(NamedTuple):
+    """A picture or a figure of matplotlib, and what it shows as JSON values."""
+
+    picture: Any
+    numbers: dict[str, Any]
 
 
 def _new_figure(width_in: float, height_in: float) -> Any:
@@ -113,7 +118,8 @@ def draw_inner_steps(options: FigureOptions) -> Drawing:
         _name_axes(axes, "updates per denoising step", title, updates)
         axes.set_ylim(bottom=0)
     panels[1].legend(fontsize=8)
-    return figure, numbers | {p: {"abs_rel": errors[p], "seconds": seconds[p]} for p in PRESETS}
+    curves = {p: {"abs_rel": errors[p], "seconds": seconds[p]} for p in PRESETS}
+    return Drawing(figure, numbers | curves)
 
 
 #: Candidates for g_s, as many as the one-number search of the paper preset has.
@@ -192,7 +198,8 @@ def draw_gs_sweep(options: FigureOptions) -> Drawing:
         axes.imshow(picture, interpolation="antialiased")
         axes.set_title(title, fontsize=9)
         axes.set(xticks=[], yticks=[])
-    return figure, {"sample": sample.label} | {name: values.tolist() for name, values in sweep.items()}
+    curves = {name: values.tolist() for name, values in sweep.items()}
+    return Drawing(figure, {"sample": sample.label} | curves)
 
 
 #: The largest relative error that has a colour of its own.
@@ -267,7 +274,7 @@ def draw_side_by_side(shown: Sequence[str], options: FigureOptions) -> Drawing:
         pictures, headings = _rows(sample, answers, options.clouds)
         cells, titles = cells + pictures, titles + headings
         numbers[sample.label] = {n: a.abs_rel for n, a in zip(methods, answers, strict=True)}
-    return grid(cells, titles, columns=1 + len(methods)), {"abs_rel": numbers}
+    return Drawing(grid(cells, titles, columns=1 + len(methods)), {"abs_rel": numbers})
 
 
 #: Every figure by name.

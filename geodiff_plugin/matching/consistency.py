@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -114,31 +115,42 @@ def _window_mean(gain: Tensor, reach: int) -> Tensor:
     return mean[0]
 
 
-Candidates = tuple[Tensor, Tensor, Iterator[tuple[Tensor, Tensor]]]
+class ViewEvidence(NamedTuple):
+    """What one right view says about the winners of the left one."""
+
+    features: Tensor  # (4, H, W), in which the log-odds of a match are linear
+    difference: Tensor  # (H, W) left-right difference in planes; infinite where it does not see the match
+
+
+class Candidates(NamedTuple):
+    """The winners of the left view, and what is known of them."""
+
+    inverse_depth: Tensor  # (H, W) 1/m
+    contrast: Tensor  # (H, W) how far their cost is below the mean plane's, averaged over a window
+    views: Iterator[ViewEvidence]  # of every right view, made as it is asked for
 
 
 def candidates(volume: CostVolume, views: Sequence[AlignedView]) -> Candidates:
-    """Inverse depths ``(H, W)`` of the winners, their contrast, and the evidence of every right view.
+    """The winners of a volume, with the evidence of these right views.
 
-    The contrast is how far the winner's cost before aggregation is below the mean plane's, averaged over a
-    window.
-
-    The evidence ``(4, H, W)``, in which the log-odds of a match are linear, is 1, the logarithm of the margin
-    to the best plane elsewhere, cost, and left-right difference; with it comes that difference in planes.
+    Its features are 1, the logarithm of the margin to the best plane elsewhere, cost, and left-right
+    difference. The cost that the contrast compares is the one before aggregation.
     """
     buffers = Buffers()
     found, unit = _left_winner(volume, buffers), 1.0 / (PATHS * COST_LEVELS)
     position, cost = found.position, (found.best * unit).clamp(0.0, 0.8)
     margin = ((found.runner_up - found.best) * unit).clamp(0.0, 0.5)
 
-    def evidence() -> Iterator[tuple[Tensor, Tensor]]:
+    def evidence() -> Iterator[ViewEvidence]:
         for view in views:
             difference = _disagreement(view, _right_winners(volume, view, buffers), position)
             differs = difference.clamp_max(AGREEMENT_PLANES)
-            yield torch.stack([torch.ones_like(margin), (margin + 0.03).log(), cost, differs]), difference
+            features = torch.stack([torch.ones_like(margin), (margin + 0.03).log(), cost, differs])
+            yield ViewEvidence(features, difference)
 
     contrast = _window_mean(found.gain, CONTRAST_REACH)
-    return volume.inverse_depth[0] + position * volume.plane_step, contrast, evidence()
+    inverse_depth = volume.inverse_depth[0] + position * volume.plane_step
+    return Candidates(inverse_depth, contrast, evidence())
 
 
 @torch.no_grad()
@@ -150,9 +162,9 @@ def match_volume(volume: CostVolume) -> Matches:
     """
     inverse_depth, contrast, views = candidates(volume, volume.aligned)
     confidence = torch.zeros_like(inverse_depth)
-    for evidence, difference in views:
+    for features, difference in views:
         odds = torch.zeros_like(difference)
-        for weight, x in zip(LOG_ODDS, evidence, strict=True):
+        for weight, x in zip(LOG_ODDS, features, strict=True):
             odds = odds + weight * x
         probability = torch.sigmoid(odds) * (contrast / LEAST_CONTRAST).clamp_max(1.0)
         agreed = torch.where(difference <= AGREEMENT_PLANES, probability, torch.zeros_like(probability))

@@ -398,7 +398,7 @@ def _from_nothing(base: Reconstruction, notes: list[Message]) -> SolvedCapture:
         bad_value("the frames", "connected by matches", "no two that are", cure)
     E, K = base.poses(models[0]), base.K(models[0])
     there = np.isfinite(E).all((1, 2))
-    after = _median_px(_residuals_px(E, K, [m for m in base.matches if there[[m[0], m[1]]].all()]))
+    after = _median_px(_residuals_px(E, K, [m for m in base.matches if there[[m.i, m.j]].all()]))
     if len(models) > 1:
         sentence = f"{len(models)} parts are not connected; the largest is used."
         notes.append(Message("capture.parts", sentence))

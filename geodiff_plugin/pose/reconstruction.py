@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -28,8 +28,14 @@ POSITION_SHARE = 0.03
 #: Frames below which the focal length is kept as given.
 FEWEST_FOR_FOCAL = 20
 
-Match = tuple[int, int, np.ndarray, np.ndarray]
-"""Frames i and j, and their matched pixels ``(n, 2)`` each."""
+
+class Match(NamedTuple):
+    """Two frames, and the pixels ``(n, 2)`` of each that show the same points."""
+
+    i: int
+    j: int
+    px_i: np.ndarray
+    px_j: np.ndarray
 
 
 def pycolmap() -> Any:
@@ -117,7 +123,7 @@ class Reconstruction:
                 if len(rows):
                     i, j = (image - 1 for image in colmap.pair_id_to_image_pair(number))
                     both = self.pixels(i, px[i][rows[:, 0]]), self.pixels(j, px[j][rows[:, 1]])
-                    self.matches.append((i, j, *both))
+                    self.matches.append(Match(i, j, *both))
 
     def model(self, E: np.ndarray) -> Any:
         """A model of posed frames without points."""

@@ -61,8 +61,13 @@ _COUNTS = 0.5
 # matches agree on is nearer to the truth than the best compromise between all.
 _NARROWER_BY = (1.0, 0.5)
 
-_Terms = tuple[float, np.ndarray, np.ndarray]
-"""Cost, gradient ``(6V,)`` and normal matrix ``(6V, 6V)``."""
+
+class _Terms(NamedTuple):
+    """A cost of poses, and how it changes with a step of all of them (``_turned``)."""
+
+    cost: float
+    gradient: np.ndarray  # (6V,)
+    normal: np.ndarray  # (6V, 6V), the normal matrix of Gauss and Newton
 
 
 @dataclass(frozen=True)
@@ -163,7 +168,7 @@ def _prior_terms(
         cost += moved @ moved + pulls @ pulls + longer**2
         gradient[block] += J.T @ moved + slope * pulls + by_step * longer
         normal[block, block] += J.T @ J + np.diag(slope**2) + np.outer(by_step, by_step)
-    return cost, gradient, normal
+    return _Terms(cost, gradient, normal)
 
 
 def solve_poses(
@@ -188,17 +193,21 @@ def solve_poses(
         data, held = _whitened(tracks, at, scale_px), _prior_terms(tracks, at, given, w_start, prior)
         J = data.left_by_pose  # with the inverse depths eliminated
         gradient, normal = np.einsum("nkp,nk->p", J, data.residuals), np.einsum("nkp,nkq->pq", J, J)
-        return trust * data.cost + held[0], trust * gradient + held[1], trust * normal + held[2]
+        return _Terms(
+            trust * data.cost + held.cost,
+            trust * gradient + held.gradient,
+            trust * normal + held.normal,
+        )
 
     damping, (cost, gradient, normal) = 1e-3, terms(Ts)
     for _ in range(_STEPS):
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
         tried = np.stack([_turned(T, step[6 * v : 6 * v + 6]) for v, T in enumerate(Ts)])
         new = terms(tried)
-        if new[0] >= cost:
+        if new.cost >= cost:
             damping *= 8.0
             continue
-        settled = cost - new[0] < 1e-6 * max(cost, 1.0)
+        settled = cost - new.cost < 1e-6 * max(cost, 1.0)
         Ts, (cost, gradient, normal), damping = tried, new, damping * 0.2
         if settled:
             break

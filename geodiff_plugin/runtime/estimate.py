@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -23,9 +23,6 @@ from geodiff_plugin.priors import DepthPrior
 from geodiff_plugin.priors.loading import reading
 from geodiff_plugin.runtime.hooks import DenoiserTap, put_channels
 
-#: What the scheduler's step is given: network output, noisy latent, and what to add to its result.
-StepInputs = tuple[Tensor, Tensor, Tensor | None]
-
 #: Value of the knob ``decoder`` for the pipeline's own autoencoder.
 FULL = "full"
 #: Value of the knob for the tiny autoencoder that is published for its latent.
@@ -37,6 +34,14 @@ KNOWN: dict[tuple[Any, ...], str] = {
     (16, 8, 1.5305): "madebyollin/taesd3",
     (16, 8, 0.3611): "madebyollin/taef1",
 }
+
+
+class StepInputs(NamedTuple):
+    """What the scheduler's step is given, and what is added to its result; ``(B, C, h, w)`` each."""
+
+    output: Tensor  # the network's
+    z_t: Tensor  # the noisy latent
+    move: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -189,14 +194,15 @@ class StepEstimate:
         moved, prior = (self.latent + move).detach(), self._codec.prior
         if self._tap is None:
             output, z_t = output_from(moved, self.eps, self._level)
-            return self._put(self._output, output), self._put(self._z_t, z_t), None
+            return StepInputs(self._put(self._output, output), self._put(self._z_t, z_t))
         if prior.max_steps == 1:
             # The step returns the clean latent: evaluate the network at the moved z_t.
-            return self._tap.output_at(moved).detach(), self._put(self._z_t, moved), None
+            return StepInputs(self._tap.output_at(moved).detach(), self._put(self._z_t, moved))
         if from_moved:
-            return self._output, self._put(self._z_t, moved), None
+            return StepInputs(self._output, self._put(self._z_t, moved))
         nothing = torch.zeros_like(self._z_t, dtype=self._wide)
-        return self._output, self._z_t, put_channels(nothing, prior.depth_channels, move)
+        added = put_channels(nothing, prior.depth_channels, move)
+        return StepInputs(self._output, self._z_t, added)
 
     def _put(self, whole: Tensor, part: Tensor) -> Tensor:
         return put_channels(whole, self._codec.prior.depth_channels, part.to(whole.dtype))

@@ -188,7 +188,7 @@ class GuidedRun:
         estimate = StepEstimate(self._codec, level, output, z_t, self._tap, latent_is_read)
         if self._step == 0:
             self._first_output = estimate.output
-        inputs: StepInputs = output, z_t, None  # unchanged, for the stock step bit for bit
+        inputs = StepInputs(output, z_t)  # unchanged, for the stock step bit for bit
         self._results[-1] = None
         if rounds := schedule.steps[self._step]:
             trajectory = self._trajectory()

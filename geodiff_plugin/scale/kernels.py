@@ -10,7 +10,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from geodiff_plugin.scale.points import KERNEL_FORMS
+from geodiff_plugin.scale.points import KERNEL_FORMS, FitTarget
 
 #: Matches of a program that are held at once, at least: fewer would compile another kernel for few matches.
 _LEAST_BLOCK = 1024
@@ -168,8 +168,7 @@ def refined_ends(
     space: str,
     ends: Tensor,
     values: Tensor,
-    matched: Tensor,
-    noise: Tensor,
+    target: FitTarget,
     bounds: tuple[Tensor, Tensor],
     limits: tuple[int, float, float],
 ) -> Tensor:
@@ -185,8 +184,10 @@ def refined_ends(
         *(bound.float().contiguous() for bound in bounds),
         torch.empty_like(values, dtype=torch.float32, memory_format=torch.contiguous_format),
         values.float().contiguous(),
-        *matched.float().contiguous(),
-        torch.as_tensor(noise).float().reshape(1),
+        target.inverse_depth.float().contiguous(),
+        target.confidence.float().contiguous(),
+        target.deviation.float().contiguous(),
+        torch.as_tensor(target.noise).float().reshape(1),
         count,
         *limits,
         FORM=KERNEL_FORMS[space],

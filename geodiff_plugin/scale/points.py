@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -58,6 +59,15 @@ ORDER_FEWEST = 40
 _REFERENCE_DOUBT = 0.04
 # Lower doubts count as this share of it at least.
 _LEAST_DOUBT = 0.16
+
+
+class FitTarget(NamedTuple):
+    """What relative maps of one image are fitted to: ``P`` matches of it."""
+
+    inverse_depth: Tensor  # (P,) 1/m, >= 0
+    confidence: Tensor  # (P,) above 0
+    deviation: Tensor  # (P,) standard deviation, in units of ``noise``
+    noise: Tensor  # () 1/m, that of a match of the reference confidence
 
 
 def depth_span(points: Matches) -> tuple[Tensor, Tensor]:
@@ -128,7 +138,7 @@ def refine_to_matches(
     inverse = matches.inverse_depth.flatten()[at].clamp_min(0.0)
     confidence = matches.confidence.flatten()[at]
     doubt = ((1.0 - confidence) / _REFERENCE_DOUBT).clamp_min(_LEAST_DOUBT)
-    matched, noise = torch.stack([inverse, confidence, doubt.sqrt()]), FIT_NOISE * matches.plane_step
+    target = FitTarget(inverse, confidence, doubt.sqrt(), FIT_NOISE * matches.plane_step)
     values = _values_at(x, matches.size, at)
     form = SPACES[space]
     ends = _ends(form, near_m, far_m)
@@ -139,10 +149,10 @@ def refine_to_matches(
         from geodiff_plugin.scale import kernels
 
         limits = FIT_ITERATIONS, FIT_FLOOR, FIT_CAUCHY
-        ends = kernels.refined_ends(space, ends, values, matched, noise, bounds, limits)
+        ends = kernels.refined_ends(space, ends, values, target, bounds, limits)
     else:
         for _ in range(FIT_ITERATIONS):
-            ends = _refine_once(form, ends, values, matched, noise, bounds)
+            ends = _refine_once(form, ends, values, target, bounds)
     at_zero, at_one = (form.forward(end, torch.ones_like(end)) for end in ends.unbind(1))
     return ordered(*form.ends(at_zero, at_one))
 
@@ -158,7 +168,7 @@ def ordered(near_m: Tensor, far_m: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _refine_once(
-    form: Space, ends: Tensor, values: Tensor, matched: Tensor, noise: Tensor, bounds: tuple[Tensor, Tensor]
+    form: Space, ends: Tensor, values: Tensor, target: FitTarget, bounds: tuple[Tensor, Tensor]
 ) -> Tensor:
     """One reweighted Gauss-Newton step on ``ends (B, 2)``, kept within ``bounds``.
 
@@ -167,11 +177,8 @@ def _refine_once(
     v_i))``, ``C = FIT_CAUCHY``, by ``e -= (J' W J)^-1 J' W r`` with ``W = diag(c_i / (v_i (1 + r_i^2 / (C^2
     v_i))))``. The variance ``v_i`` is that of the match at the map's depth plus that of the map, the weighted
     median of ``|r|``; both are measured anew in every step.
-
-    ``matched (3, P)`` are the inverse depth >= 0 of matches, their confidence, and their standard deviation
-    in units of ``noise``, ``()`` 1/m, that of a match of the reference confidence.
     """
-    inverse, confidence, deviation = matched
+    inverse, confidence, deviation, noise = target
 
     def log_depth(v: Tensor) -> Tensor:
         return form.forward(v, torch.ones_like(v)).clamp_min(1e-9).log()

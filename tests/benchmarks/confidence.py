@@ -181,14 +181,14 @@ def observe_matches(sample: StereoSample, settings: Settings, priors: PriorCache
     volume = sweep(sample, settings.device)
     with torch.no_grad():
         inverse_depth, contrast, views = consistency.candidates(volume, volume.aligned[:1])
-        ((evidence, difference),) = views
-    agreed, textured = difference <= consistency.AGREEMENT_PLANES, contrast >= consistency.LEAST_CONTRAST
+        (view,) = views
+    agreed, textured = view.difference <= consistency.AGREEMENT_PLANES, contrast >= consistency.LEAST_CONTRAST
     truth = torch.from_numpy(np.where(sample.valid, sample.depth_m, 0.0)).float()[None, None]
     truth_m = F.interpolate(truth, volume.size, mode="nearest-exact")[0, 0].numpy()
     known = (agreed & textured).cpu().numpy() & (truth_m > 0)
     error = np.abs(inverse_depth.cpu().numpy() - 1.0 / np.where(truth_m > 0, truth_m, 1.0))
     right = error <= 3.0 * float(volume.plane_step)
-    return _drawn(evidence.cpu().numpy(), right, known, settings.seed)
+    return _drawn(view.features.cpu().numpy(), right, known, settings.seed)
 
 
 def _stack(pairs: Sequence[Observed]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
