@@ -30,8 +30,10 @@ from geodiff_plugin.types import DepthFrame
 
 #: A unit of the depth maps in lengths of the poses: what nerfstudio takes without being told.
 DEPTH_UNIT = 1e-3
-#: What fits 16 bits, and how many units the median depth of a map must have for whole ones to be fine enough.
-LARGEST, FEWEST_UNITS = 65535, 500
+#: The largest value that fits 16 bits.
+LARGEST = 65535
+#: Whole units are fine enough for a map whose median depth is at least so many of them.
+FEWEST_UNITS = 500
 #: Images that trainers do not read.
 UNREAD = (".heic", ".heif")
 #: Points from which a trainer starts, at most.

@@ -47,9 +47,6 @@ from geodiff_plugin.types import MetricDepthOutput
 POSES_FILE = "poses.npz"
 #: File with one line a finished frame.
 JOURNAL = "frames.jsonl"
-#: What the poses depend on, and beside them the depth of a frame.
-OF_POSES = ("poses", "k", "fov", "trajectory")
-OF_FRAME = ("neighbours", "points", *OF_SCALE, "prior", "prior_map", "space", "steps", "seed")
 #: Memory that one process of the bundled prior takes at 640x480, bytes; what a larger prior takes is unknown.
 PROCESS_BYTES = 1.5e9
 #: What helps too where the memory is not enough.

@@ -19,9 +19,12 @@ from geodiff_plugin.types import CameraView
 SAMPLES = 1024
 #: A smaller shift cannot be measured, pixels.
 LEAST_SHIFT_PX = 0.3
-#: Decimal exponents of the inverse depths in 1/m between which a shift is sought, and the halvings of their
-#: distance, which reach 0.05 %.
-NEVER_SHIFTED, FULLY_SHIFTED, HALVINGS = -8.0, 5.0, 16
+#: Decimal exponent of an inverse depth in 1/m at which nothing shifts, above which a shift is sought.
+NEVER_SHIFTED = -8.0
+#: Decimal exponent of one at which all shifts are largest, below which it is sought.
+FULLY_SHIFTED = 5.0
+#: Halvings of the distance between these two exponents, which reach 0.05 %.
+HALVINGS = 16
 
 
 def _matrix(matrix: Tensor) -> np.ndarray:
