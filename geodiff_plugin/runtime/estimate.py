@@ -48,12 +48,12 @@ class StepInputs(NamedTuple):
 class ProcessingGrid:
     """The grid that a pipeline denoises on: ``(H, W)`` of the image, and rows and columns of padding.
 
-    ``image (N, 3, H, W)`` is the preprocessed image of the call, with its padding.
+    ``preprocessed`` is what the image processor returned for the images of the call, if it ran already.
     """
 
     content: tuple[int, int]
     padding: tuple[int, int]
-    image: Tensor | None = None
+    preprocessed: Any = None
 
     @property
     def size(self) -> tuple[int, int]:

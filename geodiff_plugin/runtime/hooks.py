@@ -68,7 +68,7 @@ def networks_of(pipe: Any) -> list[torch.nn.Module]:
 def images_in_float32(processor: Any, known: tuple[Any, Any] = (None, None)) -> AbstractContextManager[None]:
     """Let an image processor work in float32: float16 cannot hold the white of a 16-bit image, 65535.
 
-    ``known`` are an image and its ``preprocess`` already, with the arguments of the call.
+    ``known`` are an image and what ``preprocess`` returned for it with the arguments of the call, if it ran.
     """
     stock = processor.preprocess
 
@@ -80,7 +80,8 @@ def images_in_float32(processor: Any, known: tuple[Any, Any] = (None, None)) -> 
         dtype: torch.dtype = torch.float32,
     ) -> Any:
         arguments = image, processing_resolution, resample_method_input, device, torch.float32
-        images, *rest = known[1] if image is known[0] else stock(*arguments)
+        already = known[1] if image is known[0] else None
+        images, *rest = stock(*arguments) if already is None else already
         return images.to(dtype), *rest
 
     return replaced(processor, "preprocess", preprocess)

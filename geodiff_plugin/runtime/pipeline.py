@@ -158,8 +158,9 @@ class GuidedCall(_Stock):
         resolution = call["processing_resolution"]
         resolution = self.default_processing_resolution if resolution is None else resolution
         preprocess = self.image_processor.preprocess
-        image, padding, _ = preprocess(call["image"], resolution, call["resample_method_input"], device)
-        return ProcessingGrid((image.shape[-2] - padding[0], image.shape[-1] - padding[1]), padding, image)
+        found = preprocess(call["image"], resolution, call["resample_method_input"], device)
+        image, padding, _ = found
+        return ProcessingGrid((image.shape[-2] - padding[0], image.shape[-1] - padding[1]), padding, found)
 
     def progress_bar(self, iterable: Any = None, total: int | None = None, **kwargs: Any) -> Any:
         """Stock progress bars; while guided they are off, because the run shows one bar for all."""

@@ -58,8 +58,7 @@ class GuidedRun:
         self.members: list[Member] = []  # of all images, those of one image side by side
         self._plan, self._rounds, self._callback = guidance.updates, rounds, callback
         self._reads_latents = call["output_latent"] or callback is not None
-        self._codec, image, grid = codec, call["image"], codec.grid
-        self._preprocessed = image, (grid.image, grid.padding, tuple(image.shape[-2:]))
+        self._codec = codec
         self._chunk, self._step = -1, 0
         self._first_output: Tensor | None = None  # the network's, of the first step of the chunk
         self._timesteps: list[float] = []
@@ -74,8 +73,9 @@ class GuidedRun:
 
     def __enter__(self) -> GuidedRun:
         with ExitStack() as stack:
+            preprocessed = self.call["image"], self._codec.grid.preprocessed
             stack.enter_context(hooks.frozen_weights(self.pipe))
-            stack.enter_context(hooks.images_in_float32(self.pipe.image_processor, self._preprocessed))
+            stack.enter_context(hooks.images_in_float32(self.pipe.image_processor, preprocessed))
             if self.pipe._faster is not None:
                 stack.enter_context(self.pipe._faster.attached(self.pipe))
             if self._tap is not None:
