@@ -26,9 +26,9 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time names are i
     from geodiff_plugin.formats.reading import read_calibration as read_calibration
     from geodiff_plugin.priors import PRIORS as PRIORS
     from geodiff_plugin.priors import load_prior as load_prior
-    from geodiff_plugin.runtime.pipeline import GuidedMarigoldDepthPipeline as GuidedMarigoldDepthPipeline
-    from geodiff_plugin.runtime.pipeline import disable_geometry_guidance as disable_geometry_guidance
-    from geodiff_plugin.runtime.pipeline import enable_geometry_guidance as enable_geometry_guidance
+    from geodiff_plugin.runtime.guided_call import GuidedMarigoldDepthPipeline as GuidedMarigoldDepthPipeline
+    from geodiff_plugin.runtime.guided_call import disable_geometry_guidance as disable_geometry_guidance
+    from geodiff_plugin.runtime.guided_call import enable_geometry_guidance as enable_geometry_guidance
     from geodiff_plugin.types import MetricDepthOutput as MetricDepthOutput
     from geodiff_plugin.types import Rig as Rig
 
@@ -43,7 +43,7 @@ _NAMES_OF = {
     "formats.reading": "read_calibration",
     "evidence.guidance": "GeometryGuidance",
     "priors": "PRIORS load_prior",
-    "runtime.pipeline": "GuidedMarigoldDepthPipeline disable_geometry_guidance enable_geometry_guidance",
+    "runtime.guided_call": "GuidedMarigoldDepthPipeline disable_geometry_guidance enable_geometry_guidance",
     "types": "MetricDepthOutput Rig",
 }
 _MODULE_OF = modules_of(__name__, _NAMES_OF)

@@ -21,8 +21,10 @@ MOST_SAMPLES = 8
 SPACING_PX = 0.7
 #: Nearer than this, in lengths of the depth, a point is behind the camera.
 NEAREST = 1e-6
-#: Steps along a pixel's ray to the surface, and how far they may lead from the sample that the pixel got.
-STEPS, FARTHEST_STEP = 3, 0.05
+#: Steps along a pixel's ray to the surface.
+STEPS = 3
+#: They may lead this far from the sample that the pixel got, as a share of its depth.
+FARTHEST_STEP = 0.05
 
 
 @dataclass(frozen=True, eq=False)

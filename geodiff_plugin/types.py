@@ -315,7 +315,7 @@ class DepthFrame:
     K: np.ndarray  # (3, 3) pixels
     E: np.ndarray  # (4, 4) camera-to-world
     confirmed: np.ndarray | None = None  # (H, W) how many other frames have the same depth there
-    asked: np.ndarray | None = None  # (H, W) how many see the point by this depth, or a surface before it
+    observers: np.ndarray | None = None  # (H, W) how many see the point by this depth, or something before it
 
     def world(self, mask: np.ndarray | None = None) -> np.ndarray:
         """``(N, 3)`` points of the pixels of a mask, by default of all, in the world's frame."""

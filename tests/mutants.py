@@ -57,7 +57,6 @@ MUTANTS = [
         ("rays[..., :1] - (slant", "rays[..., :1] + (slant"),
         ("in_front = z > NEAREST_M", "in_front = z.abs() > NEAREST_M"),
         ("M = K_right @ T_right_from_left[:, :3, :3]", "M = K_left @ T_right_from_left[:, :3, :3]"),
-        ("M = K_right @ T_right_from_left[:3, :3]", "M = K_left @ T_right_from_left[:3, :3]"),
         ("fx * x + skew * y + cx", "fx * x + cx"),
         ("max(width - 1, 1), max(height - 1, 1)", "max(width, 1), max(height, 1)"),
         ("v <= size[0] - 1 + EDGE_PX", "v <= size[1] - 1 + EDGE_PX"),
@@ -117,8 +116,13 @@ MUTANTS = [
         ("total += cost * of_view", "total += cost"),
         ("count += of_view", "count += 1"),
         ("torch.where(in_view[plane], cost, unseen)", "cost"),
-        ("0.5 * most)", "most)"),
         tests=(f"{UNIT}matching.py",),
+    ),
+    *of(
+        "matching/planes.py",
+        ("0.5 * most)", "most)"),
+        ("infinity = K_r @ T[:3, :3]", "infinity = K @ T[:3, :3]"),
+        tests=(f"{UNIT}matching.py", f"{UNIT}skew.py"),
     ),
     *of(
         "matching/build.py",

@@ -38,9 +38,9 @@ from transformers import CLIPTextModel, CLIPTokenizer
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.priors import prior_of
-from geodiff_plugin.runtime.estimate import MapCodec, ProcessingGrid
+from geodiff_plugin.runtime.codec import MapCodec, ProcessingGrid
+from geodiff_plugin.runtime.guided_call import count_guided_steps
 from geodiff_plugin.runtime.hooks import frozen_weights
-from geodiff_plugin.runtime.pipeline import count_guided_steps
 from geodiff_plugin.runtime.run import GuidedRun
 
 UNET = ComponentSpec("unet", UNet2DConditionModel)

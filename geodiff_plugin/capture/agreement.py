@@ -61,7 +61,7 @@ def seen_in(frame: DepthFrame, other: DepthFrame) -> SeenIn:
 
 
 def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False) -> DepthFrame:
-    """A frame, with its depth averaged with that of others where they agree, ``confirmed`` and ``asked``.
+    """A frame, with its depth averaged with that of others where they agree, ``confirmed`` and ``observers``.
 
     A depth that no other frame confirms gives way to a depth on which several others agree with more
     weight; where things may be ``moving``, only if its confidence is low. Inverse depths are averaged; a
@@ -71,11 +71,11 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False
     """
     weight = OWN_WEIGHT * (LEAST_WEIGHT + frame.confidence)
     total, above = weight.copy(), weight / frame.depth
-    confirmed, asked = (np.zeros(frame.depth.shape, np.uint8) for _ in range(2))
+    confirmed, observers = (np.zeros(frame.depth.shape, np.uint8) for _ in range(2))
     missing = 1.0 - frame.confidence
     for other in others:
         said = _said_by(other, frame)
-        asked += said.seen
+        observers += said.seen
         confirmed += said.agrees
         more = np.where(said.agrees, LEAST_WEIGHT + said.confidence, 0.0)
         total += more
@@ -85,7 +85,7 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False
     alone = (confirmed == 0) & (frame.confidence < (SURE if moving else np.inf))
     seen_by = [rendered(other, frame, other.confidence) for other in others] if alone.any() else []
     for depth, _ in seen_by:  # a surface of another frame before ours speaks against ours
-        asked += alone & (depth > 0) & (depth < (1 - SAME_SHARE) * frame.depth)
+        observers += alone & (depth > 0) & (depth < (1 - SAME_SHARE) * frame.depth)
     if len(seen_by) >= OUTVOTES:
         vote = _vote(seen_by, alone)
         lost = (vote.votes >= OUTVOTES) & (vote.weight > weight[alone])
@@ -99,7 +99,7 @@ def agreed(frame: DepthFrame, others: Sequence[DepthFrame], moving: bool = False
         depth=(1.0 / inverse).astype(np.float32),
         confidence=confidence.astype(np.float32),
         confirmed=confirmed,
-        asked=np.maximum(asked, confirmed),
+        observers=np.maximum(observers, confirmed),
     )
 
 

@@ -27,6 +27,7 @@ from geodiff_plugin.types import DepthFrame
 
 #: Depth and confidence of a frame by its own run, which agreement starts from whenever it is made anew.
 ALONE = ("depth_alone", "confidence_alone")
+#: Files of a frame after agreement; ``asked`` holds the ``observers`` of ``DepthFrame``.
 AGREED = ("depth", "confidence", "confirmed", "asked")
 #: Pictures of the depth that agreement makes anew.
 FIGURES = ("depth_mm.png", "depth.png")
@@ -73,12 +74,12 @@ def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[s
     for name in names:
         others = [load(capture.names[i]) for i in choose_neighbours(solved, number[name], OTHERS, there)]
         frame = agreed(load(name), others)
-        assert frame.confirmed is not None and frame.asked is not None
+        assert frame.confirmed is not None and frame.observers is not None
         _write_agreed(out / name, frame, capture.unit)
         shares[name] = {
             "checked_against": len(others),
             "confirmed": round(float((frame.confirmed > 0).mean()), 4),
-            "unconfirmed": round(float(((frame.asked > 0) & (frame.confirmed == 0)).mean()), 4),
+            "unconfirmed": round(float(((frame.observers > 0) & (frame.confirmed == 0)).mean()), 4),
         }
     return shares
 
@@ -87,9 +88,10 @@ def _write_agreed(folder: Path, frame: DepthFrame, unit: str | None) -> None:
     write_depth_npy(folder / "depth.npy", frame.depth)
     write_depth_mm(folder / "depth_mm.png", frame.depth)
     plotting.depth_figure(frame.depth, unit=unit).save(folder / "depth.png")
-    for file in AGREED[1:]:
+    for file, values in zip(AGREED[1:], (frame.confidence, frame.confirmed, frame.observers), strict=True):
+        assert values is not None  # of agreement
         with atomic_path(folder / f"{file}.npy") as temporary:
-            np.save(temporary, getattr(frame, file))
+            np.save(temporary, values)
 
 
 def write_steady(
@@ -148,7 +150,7 @@ def write_results(
 
     def load(name: str) -> DepthFrame:
         frame = _frame(capture, out, AGREED, name)
-        return replace(frame, asked=np.ones_like(frame.asked)) if name in unsure else frame
+        return replace(frame, observers=np.ones_like(frame.observers)) if name in unsure else frame
 
     cloud, normals = fuse(names, load, capture.image)
     parts, count = (cloud.points_m, normals, cloud.colours), len(cloud.points_m)
@@ -219,8 +221,8 @@ def normals_of(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
 def kept(frame: DepthFrame) -> np.ndarray:
     """``(H, W)`` pixels that become points: sure or confirmed, never contradicted, not flying."""
     good = (frame.confidence >= LEAST_CONFIDENCE) & ~flying_points(frame.depth)
-    if frame.confirmed is not None and frame.asked is not None:
-        good &= (frame.confirmed > 0) | (frame.asked == 0)
+    if frame.confirmed is not None and frame.observers is not None:
+        good &= (frame.confirmed > 0) | (frame.observers == 0)
     return good
 
 

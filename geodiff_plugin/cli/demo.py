@@ -27,8 +27,8 @@ from geodiff_plugin.jobs.prior import load_guided_prior, prior_of_options
 from geodiff_plugin.jobs.report import single_map, summary_line
 from geodiff_plugin.jobs.telling import collected_warnings, say, silent
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
+from geodiff_plugin.runtime.guided_call import count_guided_steps
 from geodiff_plugin.runtime.machine import pick_device, timed
-from geodiff_plugin.runtime.pipeline import count_guided_steps
 
 CELL_WIDTH = 360
 COMPARISON = "comparison.png"

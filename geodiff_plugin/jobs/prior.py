@@ -15,7 +15,7 @@ from geodiff_plugin.jobs.telling import Tell
 from geodiff_plugin.priors import find_prior
 from geodiff_plugin.priors.loading import no_bars
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 
 
 def load_guided_prior(

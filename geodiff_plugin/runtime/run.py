@@ -22,7 +22,7 @@ from geodiff_plugin.messages import Message
 from geodiff_plugin.result.finish import ResultOptions, finish
 from geodiff_plugin.result.output import stack_results
 from geodiff_plugin.runtime import hooks
-from geodiff_plugin.runtime.estimate import MapCodec, StepEstimate, StepInputs
+from geodiff_plugin.runtime.codec import MapCodec, StepEstimate, StepInputs
 from geodiff_plugin.runtime.noise_levels import noise_level
 from geodiff_plugin.types import MetricDepthOutput
 

@@ -17,7 +17,7 @@ from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.config import DEFAULT, config_from_text
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.matching.build import build_cost_volume
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from tests.benchmarks.matching import (
     Pair,
     data_pairs,

@@ -21,7 +21,7 @@ from geodiff_plugin.evaluation.baselines import PriorCache, Settings, find_metho
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.metrics import evaluate_depth
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from tests.lab.options import STRENGTHS
 from tests.lab.strength import EmulatedPrior
 

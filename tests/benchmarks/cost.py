@@ -33,8 +33,8 @@ from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.geometry import resize_intrinsics
 from geodiff_plugin.matching import build
 from geodiff_plugin.priors import load_prior
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from geodiff_plugin.runtime.machine import PeakMemory
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from tests.benchmarks.operations import Size, calls_of_all, count_operations
 
 __all__ = ["AXES", "Axis", "exponent", "main", "resized_pair", "tables", "with_tables"]

@@ -19,8 +19,8 @@ from multiprocessing import get_context
 import torch
 from diffusers.utils import logging as diffusers_logging
 
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from geodiff_plugin.runtime.machine import PeakMemory, pick_device, timed
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from tests.benchmarks.measuring import waits_by_place
 from tests.benchmarks.operations import WAYS, Size, call_of, calls_of_all, count_operations, tiny_folder
 from tests.benchmarks.random_marigold import random_marigold

@@ -37,8 +37,8 @@ from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, DemoPair, read_demo_pair
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.runtime.graphs import FasterNetworks
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from geodiff_plugin.runtime.machine import timed
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from tests.benchmarks import full_sizes
 from tests.benchmarks.cost import resized_pair
 from tests.benchmarks.measuring import Cost, costs, stage_milliseconds, waits_by_place

@@ -30,7 +30,7 @@ from geodiff_plugin import _kernels
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from tests.benchmarks.cost import resized_pair
 from tests.benchmarks.measuring import holders
 from tests.benchmarks.random_marigold import random_marigold

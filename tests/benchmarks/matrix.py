@@ -17,8 +17,8 @@ from diffusers.utils import logging as diffusers_logging
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.priors import load_prior
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from geodiff_plugin.runtime.machine import pick_device
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 
 __all__ = ["SWITCHES", "deviation", "main"]
 

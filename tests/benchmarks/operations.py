@@ -26,8 +26,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from examples.fitted_lora import draw_points
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evidence.guidance import GeometryGuidance
-from geodiff_plugin.runtime.estimate import TINY, tiny_autoencoder
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from geodiff_plugin.runtime.codec import TINY, tiny_autoencoder
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from tests.benchmarks.full_sizes import UNET, VAE
 from tests.benchmarks.random_marigold import EMPTY_PROMPT_TOKENS, narrowed, random_marigold, random_tiny
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from diffusers import AutoencoderTiny
 
-from geodiff_plugin.runtime import estimate
-from geodiff_plugin.runtime.estimate import KNOWN, _loaded
+from geodiff_plugin.runtime import codec
+from geodiff_plugin.runtime.codec import KNOWN, _loaded
 from tests.conftest import guided_call, make_vae
 
 
@@ -107,6 +107,6 @@ def test_sd_2s_latent_is_known(pipe, guided, monkeypatch):
     loaded = Mock(return_value=make_vae())
     pipe.vae.register_to_config(scaling_factor=0.18215)
     monkeypatch.setitem(KNOWN, (4, 2, 0.18215), KNOWN[4, 8, 0.18215])  # a tiny one has cells of 2 pixels
-    monkeypatch.setattr(estimate, "_loaded", loaded)
+    monkeypatch.setattr(codec, "_loaded", loaded)
     guided("tiny")
     assert {call.args[0] for call in loaded.call_args_list} == {"madebyollin/taesd"}

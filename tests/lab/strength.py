@@ -30,8 +30,8 @@ from geodiff_plugin.evaluation.metrics import evaluate_depth, filled, to_space
 from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, method_title, most_of
 from geodiff_plugin.jobs.journal import Item, Record
 from geodiff_plugin.priors import prior_of
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from geodiff_plugin.runtime.noise_levels import noise_level
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
 from tests.lab.edges import edge_error, surface_error
 from tests.lab.options import STRENGTHS, Strength, StrengthOptions
 

@@ -149,7 +149,7 @@ def test_agreement_averages_within_the_error_marks_what_is_alone_and_outvotes_it
     middle, hole = (np.zeros(truth.depth.shape, bool) for _ in range(2))
     middle[20:-20, 40:-40] = hole[62:88, 82:108] = True
     one = agreed(wrong, [depth_frame(5)])
-    assert (one.confirmed[hole] == 0).mean() > 0.95 and (one.asked[hole] > 0).mean() > 0.95
+    assert (one.confirmed[hole] == 0).mean() > 0.95 and (one.observers[hole] > 0).mean() > 0.95
     np.testing.assert_allclose(one.depth[hole], wrong.depth[hole], rtol=1e-5)
     np.testing.assert_allclose(one.confidence[hole], 0.6, atol=1e-6)
     three = agreed(wrong, [depth_frame(3, 0.99), depth_frame(5, 1.01), depth_frame(6)])
@@ -322,7 +322,7 @@ def test_frames_that_are_not_trusted_are_named_and_marked(model, monkeypatch):
         return grid(cells, names, **how)
 
     def fusing(names, load, image):
-        lowest.extend(load(name).asked.min() for name in names)
+        lowest.extend(load(name).observers.min() for name in names)
         return fuse(names, load, image)
 
     monkeypatch.setattr(run, "_write_frame", doubting)

@@ -15,7 +15,7 @@ from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.datasets.sample import SampleRef, StereoSample, make_sample
 from geodiff_plugin.evaluation.experiment import score
 from geodiff_plugin.formats import write_depth_mm, write_pfm
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from geodiff_plugin.types import Rig
 from tests.contracts.tiny_transformers import MODELS, make_transformers
 from tests.evaluating import write_scenes

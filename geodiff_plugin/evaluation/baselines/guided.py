@@ -24,7 +24,7 @@ from geodiff_plugin.priors import load_prior, prior_of
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import no_bars
 from geodiff_plugin.priors.map import DepthMapPipeline
-from geodiff_plugin.runtime.pipeline import enable_geometry_guidance
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from geodiff_plugin.scale.space import SPACES
 
 

@@ -26,7 +26,7 @@ from geodiff_plugin.priors import DepthPrior, prior_of
 from geodiff_plugin.priors.pipeline import RESAMPLING, DepthDiffusionPipeline
 from geodiff_plugin.result.ensemble import ensemble_metric
 from geodiff_plugin.result.output import image_labels
-from geodiff_plugin.runtime.estimate import MapCodec, ProcessingGrid, tiny_autoencoder
+from geodiff_plugin.runtime.codec import MapCodec, ProcessingGrid, tiny_autoencoder
 from geodiff_plugin.runtime.graphs import FasterNetworks
 from geodiff_plugin.runtime.hooks import Exclusive, networks_of
 from geodiff_plugin.runtime.noise_levels import check_scheduler
