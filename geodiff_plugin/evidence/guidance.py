@@ -16,8 +16,8 @@ from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.terms import TERMS
 from geodiff_plugin.config import PRESETS, GuidanceConfig, UpdatePlan
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.evidence.inputs import read_inputs, split_views
-from geodiff_plugin.evidence.photographs import EstimatedRig, estimate_rig
+from geodiff_plugin.evidence.inputs import Arguments, read_inputs, split_views
+from geodiff_plugin.evidence.photographs import EstimatedRig, KnownLengths, estimate_rig
 from geodiff_plugin.evidence.prepare import make_evidence
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.formats import picture_size, read_calibration
@@ -119,7 +119,8 @@ class GeometryGuidance:
         for name in self.config.weights:
             check_choice(name, "a key of weights", TERMS)
         with noted() as self.warned:
-            self.inputs = read_inputs(right, K, E, points, points_confidence, cropped=cropped, unit=unit)
+            given = Arguments(right, K, E, points, points_confidence)
+            self.inputs = read_inputs(given, cropped=cropped, unit=unit)
         self.assumed: list[Message] = []
         if not isinstance(K, (tuple, list)):
             assume_same_centre(self)
@@ -252,9 +253,9 @@ class GeometryGuidance:
         """
         photographs = list(left) if right is None and isinstance(left, (list, tuple)) else [left, right]
         Ks = K if K_right is None else [K, K_right]
-        known = {"baseline_m": baseline_m, "known_length": known_length, "points": points}
+        known = KnownLengths(baseline_m, known_length, points)
         with noted() as warned:
-            rig = estimate_rig(photographs, K=Ks, fov=fov, cropped=cropped, **known)
+            rig = estimate_rig(photographs, known, K=Ks, fov=fov, cropped=cropped)
             views = zip((None, *photographs[1:]), rig.Ks, (np.eye(4), *rig.Es), strict=True)
             guidance = cls.from_views(
                 list(views),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
 
@@ -49,64 +49,66 @@ class Inputs:
         return None if self.points is None else self.points.to(device, torch.float32)
 
 
-def read_inputs(
-    right: Any,
-    K: Any,
-    E: Any,
-    points: Any,
-    points_confidence: Any = None,
-    *,
-    cropped: bool = False,
-    unit: str | None = "m",
-) -> list[Inputs]:
-    """Arguments of ``GeometryGuidance`` in any of their forms, checked: one entry per left image."""
+@dataclass(frozen=True, eq=False)
+class Arguments:
+    """Arguments of ``GeometryGuidance`` in any of their forms: of all left images, or of one of them."""
+
+    right: Any
+    K: Any
+    E: Any
+    points: Any
+    points_confidence: Any
+
+    def of_image(self, i: int, count: int) -> Arguments:
+        """Those of image ``i`` of so many."""
+        return Arguments(**{name: _entry(value, name, i, count) for name, value in vars(self).items()})
+
+
+def read_inputs(given: Arguments, *, cropped: bool = False, unit: str | None = "m") -> list[Inputs]:
+    """The arguments checked, one entry per left image."""
+    right, points = given.right, given.points
     if right is None and points is None:
         bad_value("right", "an image, or None together with points", "None without points")
-    if points is None and points_confidence is not None:
+    if points is None and given.points_confidence is not None:
         bad_value("points_confidence", "given with points", "no points")
     lists = [x for x in (right, points) if isinstance(x, list) and not _is_nested_matrix(x)]
     count = len(lists[0]) if lists else 1
     if right is not None and not isinstance(right, list) and count == 1:
         # With one left image a list of matrices can only mean the tuple of cameras.
-        K, E = (
-            tuple(x) if isinstance(x, list) and len(x) > 1 and not _is_nested_matrix(x) else x for x in (K, E)
-        )
+        given = replace(given, K=_as_views(given.K), E=_as_views(given.E))
     if count == 0:
         bad_value("right", "an image or a list with one image per left image", "an empty list")
     inputs = []
     for i in range(count):
         label = "{}" if count == 1 else f"{{}}[{i}]"
-        arguments = {"right": right, "K": K, "E": E, "points": points, "points_confidence": points_confidence}
-        entry = {name: _entry(value, name, i, count) for name, value in arguments.items()}
-        known = entry["points"]
-        if known is not None:
-            known = as_points(known, label.format("points"), entry["points_confidence"])
-        inputs.append(_read_image(entry["right"], entry["K"], entry["E"], known, label, cropped, unit))
+        inputs.append(_read_image(given.of_image(i, count), label, cropped, unit))
     have_points = [entry.points is not None for entry in inputs]
-    for name, given in (("right", [bool(entry.views) for entry in inputs]), ("points", have_points)):
-        if any(given) and not all(given):
-            bad_value(name, "given for every left image or for none", f"None for {given.index(False)}")
+    for name, there in (("right", [bool(entry.views) for entry in inputs]), ("points", have_points)):
+        if any(there) and not all(there):
+            bad_value(name, "given for every left image or for none", f"None for {there.index(False)}")
     return inputs
 
 
-def _read_image(
-    right: Any, K: Any, E: Any, points: Tensor | None, label: str, cropped: bool, unit: str | None
-) -> Inputs:
+def _read_image(given: Arguments, label: str, cropped: bool, unit: str | None) -> Inputs:
     """The entry of one left image; ``label`` formats argument names for messages."""
-    given = right if isinstance(right, tuple) else () if right is None else (right,)
-    count, name = len(given), label.format("right")
+    points: Tensor | None = None
+    if given.points is not None:
+        points = as_points(given.points, label.format("points"), given.points_confidence)
+    right, K = given.right, given.K
+    rights = right if isinstance(right, tuple) else () if right is None else (right,)
+    count, name = len(rights), label.format("right")
     names = [name if count == 1 else f"{name}, view {v + 1}," for v in range(count)]
-    images = [as_image_01(image, name) for image, name in zip(given, names, strict=True)]
+    images = [as_image_01(image, name) for image, name in zip(rights, names, strict=True)]
     K_left, K_rights = _intrinsics(K, label.format("K"), count)
-    poses = _poses(E, label.format("E"), count, unit)
+    poses = _poses(given.E, label.format("E"), count, unit)
     rigs = tuple(Rig(K_left, K_right, pose) for K_right, pose in zip(K_rights, poses, strict=True))
     for v, (K_right, image) in enumerate(zip(K_rights, images, strict=True)):
         if not cropped:
             of_view = isinstance(K, tuple) and not np.array_equal(K_right, K_left)
             K_name = f"{label.format('K')}[{_view(v, count)}]" if of_view else label.format("K")
             check_size_of(K_right, image_size(image), K_name, "the right image")
-        if isinstance(given[v], Image.Image):
-            warn_of_other_lens(given[v], K_right, names[v])
+        if isinstance(rights[v], Image.Image):
+            warn_of_other_lens(rights[v], K_right, names[v])
     matrices = [(torch.from_numpy(rig.K_right), torch.from_numpy(rig.T_right_from_left)) for rig in rigs]
     views = tuple(CameraView(x, K.float(), T.float()) for x, (K, T) in zip(images, matrices, strict=True))
     if points is not None and unit == "m":
@@ -118,6 +120,12 @@ def _is_nested_matrix(value: list[Any]) -> bool:
     """A matrix written as nested lists of numbers, as opposed to a list with one entry per image."""
     rows = bool(value) and all(isinstance(row, (list, tuple)) for row in value)
     return rows and all(isinstance(entry, Real) for row in value for entry in row)
+
+
+def _as_views(value: Any) -> Any:
+    """A list of matrices as the tuple of one per view."""
+    several = isinstance(value, list) and len(value) > 1 and not _is_nested_matrix(value)
+    return tuple(value) if several else value
 
 
 def _entry(value: Any, name: str, i: int, count: int) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -78,14 +78,20 @@ def _as_cloud(points: Tensor, K_left: Tensor, size: tuple[int, int]) -> np.ndarr
     return xyz[xyz[:, 2] > 0].double().numpy()
 
 
+class KnownLengths(NamedTuple):
+    """What can give estimated poses their unit, as ``from_photographs`` takes it; ``None`` if unknown."""
+
+    baseline_m: float | None
+    known_length: tuple[float, float, float, float, float] | None
+    points: Any
+
+
 def estimate_rig(
     photographs: Sequence[Any],
+    known: KnownLengths,
     *,
     K: Any = None,
     fov: float | None = None,
-    baseline_m: float | None = None,
-    known_length: tuple[float, float, float, float, float] | None = None,
-    points: Any = None,
     cropped: bool = False,
 ) -> EstimatedRig:
     """Cameras of two photographs or more, left one first; arguments as ``from_photographs``."""
@@ -94,11 +100,11 @@ def estimate_rig(
     names = ["left", *(f"right photograph {i}" for i in range(1, len(photographs)))]
     images = [as_image_01(p, n) for p, n in zip(photographs, names, strict=True)]
     Ks, notes = _cameras(photographs, images, K, fov, cropped)
-    if baseline_m is not None:
-        check_number(baseline_m, "baseline_m", 1e-6, 1e6)
+    if known.baseline_m is not None:
+        check_number(known.baseline_m, "baseline_m", 1e-6, 1e6)
     K_left = torch.as_tensor(Ks[0], dtype=torch.float32, device="cpu")
     size = image_size(images[0])
-    cloud = None if points is None else _as_cloud(as_points(points, "points"), K_left, size)
+    cloud = None if known.points is None else _as_cloud(as_points(known.points, "points"), K_left, size)
     images = [cleaned(image, DEFAULT) for image in images]
 
     def posed(Ts: Iterable[np.ndarray]) -> list[CameraView]:
@@ -115,7 +121,7 @@ def estimate_rig(
         Ts, tracks = polished(views, Ts, depth_m, tracks.seen_anywhere())
         spread = depth_spread(tracks, Ts)
     factor = tracks.K_left[0, 0] / Ks[0][0, 0]
-    scale = find_scale(tracks, Ts, factor, baseline_m, known_length, cloud)
+    scale = find_scale(tracks, Ts, factor, known.baseline_m, known.known_length, cloud)
     Ts[:, :3, 3] *= scale.factor
     return EstimatedRig(
         size[::-1],
