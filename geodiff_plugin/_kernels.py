@@ -10,9 +10,10 @@ from __future__ import annotations
 import functools
 import importlib.util
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any
 
 import torch
 
@@ -55,6 +56,16 @@ def kernels_in_use() -> str:
     if not torch.cuda.is_available() or torch.version.hip is not None:
         return "plain torch: kernels need CUDA"
     return "Triton on CUDA, compiled at the first call on a machine"
+
+
+def launched_on(tensor: torch.Tensor, launch: Callable[..., Any]) -> Callable[..., Any]:
+    """``kernel[grid]`` on the device of a tensor: Triton's own launch is on the current device."""
+
+    def launched(*args: Any, **kwargs: Any) -> None:
+        with torch.cuda.device_of(tensor):
+            launch(*args, **kwargs)
+
+    return launched
 
 
 @contextmanager

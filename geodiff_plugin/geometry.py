@@ -77,12 +77,13 @@ def is_rectified(K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> 
     The rotation is the identity to 1e-3 an entry, ``|t_y|`` and ``|t_z|`` are below 1 % of ``|t_x|``, f
     agrees to 0.1 %, skew and cy to 0.1 % of f; cx may differ. Both K have as many pixels per radian.
     """
-    identity = torch.eye(3, dtype=T_right_from_left.dtype, device=T_right_from_left.device)
-    turned = (T_right_from_left[..., :3, :3] - identity).abs().amax((-2, -1))
-    t = T_right_from_left[..., :3, 3].abs()
-    uneven = (K_left - K_right).abs()[..., [0, 0, 1, 1], [0, 1, 1, 2]].amax(-1)
-    sideways = t[..., 1:].amax(-1) < SIDEWAYS_TOLERANCE * t[..., 0]
-    return (turned <= ANGLE_TOLERANCE) & sideways & (uneven <= ANGLE_TOLERANCE * K_left[..., 1, 1])
+    K, K_r, T = (each.detach().cpu().numpy() for each in (K_left, K_right, T_right_from_left))
+    turned = np.abs(T[..., :3, :3] - np.eye(3, dtype=T.dtype)).max((-2, -1))
+    t = np.abs(T[..., :3, 3])
+    uneven = np.abs(K - K_r)[..., [0, 0, 1, 1], [0, 1, 1, 2]].max(-1)
+    sideways = t[..., 1:].max(-1) < SIDEWAYS_TOLERANCE * t[..., 0]
+    rectified = (turned <= ANGLE_TOLERANCE) & sideways & (uneven <= ANGLE_TOLERANCE * K[..., 1, 1])
+    return torch.from_numpy(np.asarray(rectified))
 
 
 class PlaneRays(NamedTuple):

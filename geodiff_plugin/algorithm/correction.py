@@ -202,17 +202,22 @@ def highest(values: Tensor, reach: int) -> Tensor:
     return values
 
 
-def _robust(residual: Tensor, noise: Tensor, error: Tensor, config: GuidanceConfig) -> Tensor:
-    """Cauchy weight of residuals whose variance is that of the match plus that of the prior."""
-    return 1.0 / (1.0 + residual**2 / (config.outlier_width**2 * (noise**2 + error**2)))
+def _variance(noise: Tensor, error: Tensor, config: GuidanceConfig) -> Tensor:
+    """Variance of a match plus that of the prior, from which ``_robust`` counts a residual as large."""
+    return config.outlier_width**2 * (noise**2 + error**2)
+
+
+def _robust(residual: Tensor, variance: Tensor) -> Tensor:
+    """Cauchy weight of residuals."""
+    return 1.0 / (1.0 + residual**2 / variance)
 
 
 def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: GuidanceConfig) -> Tensor:
     """The correction ``(B, 1, h, w)`` that follows matches over wide regions only."""
-    stiff = torch.full_like(error, STIFF_SMOOTHNESS)
+    stiff, variance = torch.full_like(error, STIFF_SMOOTHNESS), _variance(observed.noise, error, config)
 
     def robust(left_over: Tensor) -> Tensor:
-        return trusted * _robust(left_over, observed.noise, error, config)
+        return trusted * _robust(left_over, variance)
 
     rounds, inertia = REWEIGHTINGS + 1, STIFF_INERTIA * stiff
     return solve_robust(
@@ -282,10 +287,11 @@ def fit_depth(
     observed = _observations(depth_m, target, left_01, config)
     error = _on_grid(error, target.size)
     broad = _stiff(observed, observed.weight, error, config)
-    trusted = observed.weight * _robust(broad - observed.residual, observed.noise, error, config)
+    trusted = observed.weight * _robust(broad - observed.residual, _variance(observed.noise, error, config))
+    width = RESIDUAL_CAUCHY * observed.noise
 
     def robust(left_over: Tensor) -> Tensor:
-        return trusted / (1.0 + (left_over / (RESIDUAL_CAUCHY * observed.noise)) ** 2)
+        return trusted / (1.0 + (left_over / width) ** 2)
 
     total, weights = torch.zeros_like(observed.residual), trusted
     decided = torch.zeros_like(total)

@@ -44,18 +44,19 @@ class FiniteWatch:
 
     def __init__(self) -> None:
         self._names: list[tuple[str, int]] = []
-        self._finite: list[Tensor] = []
+        self._extremes: list[Tensor] = []
 
     def note(self, name: str, step: int, tensor: Tensor) -> None:
         """Record a tensor of a step without waiting for its device; ``name`` is for the message."""
         self._names.append((name, step))
-        self._finite.append(torch.isfinite(tensor.detach()).all())
+        # The least and the largest value are finite if all are: one operation tells both.
+        self._extremes.append(torch.stack(tensor.detach().float().aminmax()))
 
     def check(self, dtype: torch.dtype) -> None:
         """Raise ``InputError`` on the first tensor that was not finite; ``dtype`` is the prior's."""
-        if not self._finite:
+        if not self._extremes:
             return
-        finite = torch.stack(self._finite).cpu()
+        finite = torch.stack(self._extremes).cpu().isfinite().all(1)
         if finite.all():
             return
         name, step = self._names[int((~finite).nonzero()[0])]

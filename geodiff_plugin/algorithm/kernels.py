@@ -9,12 +9,15 @@ the bound on registers admits.
 from __future__ import annotations
 
 import functools
+import itertools
+import math
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from geodiff_plugin._kernels import launched_on
 from geodiff_plugin.algorithm import solver
 from geodiff_plugin.algorithm.solver import FieldSystem
 
@@ -41,7 +44,7 @@ FROM_COARSER = 2
 WORK_ARRAYS = 6
 #: Sums that it keeps of every tile.
 SUMS = 3
-#: A counter a row of so many numbers, whose address is aligned then, and compiled for once.
+#: Counters and tensors begin at multiples of so many numbers: kernels are compiled for aligned addresses.
 ALIGNED = 4
 #: Partial sums that are added at a time.
 GATHERED = tl.constexpr(256)
@@ -202,6 +205,7 @@ def _direction_tile(
     )
     share = _total(partial + (step % 2) * count + field * tiles, tiles)
     share /= tl.maximum(_total(partial + ((step + 1) % 2) * count + field * tiles, tiles), TINY)
+    share = tl.where(step > 0, share, 0.0)  # there is no step before the first
     # The direction of the step before is read by other programs while the new one is written.
     z, old = work + area + base, work + (5 - step % 2) * area + base
     here = _direction_at(z, old, p, inside, share, step)
@@ -281,15 +285,29 @@ def _most_programs(device: torch.device) -> int:
     return RESIDENT * torch.cuda.get_device_properties(device).multi_processor_count
 
 
+def _empty(like: Tensor, *shapes: tuple[int, ...]) -> list[Tensor]:
+    """Tensors in one allocation, each of which begins at an address that a kernel is compiled for once."""
+    begins = list(itertools.accumulate((_aligned(math.prod(shape)) for shape in shapes), initial=0))
+    buffer = like.new_empty(begins[-1])
+    return [buffer.as_strided(s, _strides(s), first) for s, first in zip(shapes, begins, strict=False)]
+
+
+def _aligned(count: int) -> int:
+    return -(-count // ALIGNED) * ALIGNED
+
+
+def _strides(shape: tuple[int, ...]) -> list[int]:
+    """Of a contiguous tensor."""
+    return [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
+
+
 def _coarser(system: FieldSystem) -> FieldSystem:
     """``FieldSystem.coarser`` of tensors that are contiguous."""
     batch, channels, height, width = system.pull.shape
     h, w = -(-height // 2), -(-width // 2)
-    new = functools.partial(system.pull.new_empty)
-    coarse = FieldSystem(
-        new(batch, 1, h, w), new(batch, channels, h, w), new(batch, 1, h, w - 1), new(batch, 1, h - 1, w)
-    )
-    coarsen_kernel[(triton.cdiv(h * w, TILE), batch * channels)](
+    shapes = (1, h, w), (channels, h, w), (1, h, w - 1), (1, h - 1, w)
+    coarse = FieldSystem(*_empty(system.pull, *((batch, *shape) for shape in shapes)))
+    launched_on(system.pull, coarsen_kernel[(triton.cdiv(h * w, TILE), batch * channels)])(
         *vars(system).values(), *vars(coarse).values(), height, width, h, w, channels, TILE=TILE
     )
     return coarse
@@ -307,13 +325,12 @@ def _conjugate_gradients(system: FieldSystem, start: Tensor | None, steps: int, 
     tile, warps = (SINGLE_TILE, SINGLE_WARPS) if alone else (TILE, WARPS)
     count = triton.cdiv(n, tile) * fields
     programs = fields if alone else min(count, _most_programs(start.device))
-    x, work = torch.empty_like(system.pull), start.new_empty(WORK_ARRAYS * fields * n)
-    partial = start.new_ones(SUMS * count)  # in the first step the sum of the step before must be finite
+    x, work, partial = _empty(start, system.pull.shape, (WORK_ARRAYS * fields * n,), (SUMS * count,))
     options = {"num_warps": warps}
     if start.is_cuda:  # the interpreter knows neither
         options |= {"maxnreg": SINGLE_REGISTERS if alone else MOST_REGISTERS}
         options |= {} if alone else {"launch_cooperative_grid": True}
-    conjugate_gradients_kernel[(programs,)](
+    launched_on(start, conjugate_gradients_kernel[(programs,)])(
         *vars(system).values(), start, x, work, partial, arrivals,
         height, width, *start.shape[-2:], channels, fields, steps, origin,
         TILE=tile, ALONE=alone, **options,

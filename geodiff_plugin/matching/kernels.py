@@ -14,6 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from geodiff_plugin._kernels import launched_on
 from geodiff_plugin.geometry import to_device_of
 from geodiff_plugin.matching.alignment import AlignedView, even_shifts
 from geodiff_plugin.matching.census import COST_LEVELS, MARGIN_PX, SIDE, VOTE_LEVELS, grey_levels
@@ -28,6 +29,8 @@ _COST_LEVELS = tl.constexpr(COST_LEVELS)
 COST_BLOCK = 32, 16
 # Samples of the right images that are interpolated at once: 128 MB.
 _SAMPLES_AT_ONCE = 1 << 25
+# Planes of a path that fit the registers of a warp.
+_PLANES_A_WARP = 512
 # Sums that a program of the winner holds at once, in registers of its four warps.
 _SUMS_AT_ONCE = 1024
 
@@ -102,6 +105,11 @@ def paths_kernel(
         tl.atomic_add(total_at + n * total_step, path, mask=used, sem="relaxed")
 
 
+def path_warps(planes: int) -> int:
+    """Warps of a path of so many planes."""
+    return max(1, triton.next_power_of_2(planes) // _PLANES_A_WARP)
+
+
 def aggregate(levels: Tensor, penalties: Tensor, step: int, axes: Sequence[tuple[int, int]]) -> Tensor:
     """``aggregation.aggregate`` along any axes, each both ways, as ``(D, H, W)`` int32.
 
@@ -112,7 +120,7 @@ def aggregate(levels: Tensor, penalties: Tensor, step: int, axes: Sequence[tuple
     total = torch.zeros(height, width, planes, dtype=torch.int32, device=levels.device)
     diagonal = any(down and across for down, across in axes)
     lines = height + width - 1 if diagonal else max(height, width)
-    paths_kernel[(lines, len(axes), 2)](
+    launched_on(levels, paths_kernel[(lines, len(axes), 2)])(
         levels,
         penalties,
         total,
@@ -124,7 +132,7 @@ def aggregate(levels: Tensor, penalties: Tensor, step: int, axes: Sequence[tuple
         DOWN=tuple(down for down, _ in axes),
         ACROSS=tuple(across for _, across in axes),
         PADDED=triton.next_power_of_2(planes),
-        num_warps=1,
+        num_warps=path_warps(planes),
     )
     return total.permute(2, 0, 1)
 
@@ -200,7 +208,7 @@ def _winner(total: Tensor, evidence: tuple[Tensor, Tensor] | None) -> list[Tenso
     levels, in_view = evidence or (total, total)
     maps = torch.empty(4 if evidence else 1, height, width, dtype=torch.float32, device=total.device)
     outputs = list(maps) if evidence else [maps[0]] * 4
-    winner_kernel[(triton.cdiv(height * width, block),)](
+    launched_on(total, winner_kernel[(triton.cdiv(height * width, block),)])(
         total,
         levels,
         in_view,
@@ -275,7 +283,7 @@ def census_costs(left: Tensor, view: AlignedView) -> Tensor:
         part = range(first, min(planes, first + at_once))
         right, starts = _right_levels(view, (height, width), part)
         grid = triton.cdiv(pixels, COST_BLOCK[0]), triton.cdiv(len(part), COST_BLOCK[1])
-        census_cost_kernel[grid](
+        launched_on(left, census_cost_kernel[grid])(
             left,
             right,
             starts,
@@ -383,7 +391,7 @@ def looked_up(levels: Tensor, rows: np.ndarray, columns: np.ndarray) -> Tensor:
     found = torch.empty(height, width, planes, dtype=levels.dtype, device=levels.device)
     at = (to_device_of(levels, each.T.astype(np.int32)) for each in (rows, columns))
     grid = triton.cdiv(height * width, COST_BLOCK[0]), triton.cdiv(planes, COST_BLOCK[1])
-    look_up_kernel[grid](
+    launched_on(levels, look_up_kernel[grid])(
         levels,
         *at,
         found,

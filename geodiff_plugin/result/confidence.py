@@ -9,7 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._strips import row_strips
+from geodiff_plugin._kernels import launch_bound
+from geodiff_plugin._strips import STRIP_PIXELS, row_strips
 from geodiff_plugin.algorithm.terms import match_exposure
 from geodiff_plugin.geometry import as_fine_as, image_size, warp_right_to_left
 from geodiff_plugin.types import CameraView
@@ -128,10 +129,12 @@ def reprojection(
         image, K_right = as_fine_as(image, K_right, K_left[0])
         warped, seen = _warped(image[None], depth_m, K_left, K_right[None], T[None])
         error = torch.zeros_like(depth_m)
-        for channel in range(left_01.shape[1]):  # one by one: at this size a copy of all three counts
-            layer = slice(channel, channel + 1)
-            matched = match_exposure(warped[:, layer], left_01[:, layer], seen)
-            error += matched.sub_(left_01[:, layer]).abs_()
+        # One by one where a copy of all three counts.
+        at_once = left_01.shape[1] if launch_bound(depth_m) and depth_m.numel() <= STRIP_PIXELS else 1
+        for layer in range(0, left_01.shape[1], at_once):
+            channels = slice(layer, layer + at_once)
+            matched = match_exposure(warped[:, channels], left_01[:, channels], seen)
+            error += matched.sub_(left_01[:, channels]).abs_().sum(1, keepdim=True)
         error /= left_01.shape[1]
         best = torch.where(seen, torch.minimum(best, error), best)
         visible |= seen

@@ -10,6 +10,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from geodiff_plugin._kernels import launched_on
+
 #: Values that a program holds at once.
 BLOCK = 2048
 #: Programs of a group at most, because each of them adds up the sums of all.
@@ -64,8 +66,8 @@ def group_norm(x: Tensor, groups: int, weight: Tensor, bias: Tensor, eps: float)
     parts = triton.cdiv(length, part)
     sums = torch.empty(rows, parts, 2, dtype=torch.float32, device=x.device)
     out = torch.empty_like(x)
-    moments_kernel[(rows, parts)](x, sums, length, part, parts, BLOCK=BLOCK)
-    normalise_kernel[(rows, parts)](
+    launched_on(x, moments_kernel[(rows, parts)])(x, sums, length, part, parts, BLOCK=BLOCK)
+    launched_on(x, normalise_kernel[(rows, parts)])(
         x, out, sums, weight, bias, length, length // channels, channels, groups, part, parts, eps,
         PARTS=MOST_PARTS, BLOCK=BLOCK,
     )  # fmt: skip

@@ -10,6 +10,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from geodiff_plugin._kernels import launched_on
 from geodiff_plugin.scale.points import KERNEL_FORMS, FitTarget
 
 #: Matches of a program that are held at once, at least: fewer would compile another kernel for few matches.
@@ -179,7 +180,7 @@ def refined_ends(
     rows, count = values.shape
     block = max(_LEAST_BLOCK, triton.next_power_of_2(count))
     refined = ends.float().clone().contiguous()
-    refine_kernel[(rows,)](
+    launched_on(values, refine_kernel[(rows,)])(
         refined,
         *(bound.float().contiguous() for bound in bounds),
         torch.empty_like(values, dtype=torch.float32, memory_format=torch.contiguous_format),

@@ -59,13 +59,15 @@ def launches() -> Iterator[Compiled]:
 
 def _of_the_matching() -> Iterator[Compiled]:
     paths = "*u8 *i16 *i32 i32 i32 i32 i32 i32 i32 i32"
-    for planes in (128, 256, 512):
+    for planes in (128, 256, 512, 1024, 2048):
         axes = {"DOWN": (1, 0, 1, 1), "ACROSS": (0, 1, 1, -1), "PADDED": planes}
-        yield Compiled(f"paths, {planes} planes", matching.paths_kernel, paths, axes, 1)
+        yield Compiled(
+            f"paths, {planes} planes", matching.paths_kernel, paths, axes, matching.path_warps(planes)
+        )
     winner = "*i32 *u8 *i1 *fp32 *fp32 *fp32 *fp32" + 9 * " i32"
-    for evidence in (True, False):
-        sizes = {"EVIDENCE": evidence, "BLOCK": 8, "PADDED": 128}
-        name = "winner and evidence" if evidence else "winner"
+    for evidence, padded in ((True, 128), (False, 128), (True, 2048)):
+        sizes = {"EVIDENCE": evidence, "BLOCK": max(1, 1024 // padded), "PADDED": padded}
+        name = f"winner{' and evidence' if evidence else ''}, {padded} planes"
         yield Compiled(name, matching.winner_kernel, winner, sizes, 4)
     block = dict(zip(("BLOCK", "PLANES"), matching.COST_BLOCK, strict=True))
     census = {"SIDE": SIDE, "MARGIN": MARGIN_PX, "VOTE": VOTE_LEVELS}

@@ -1,0 +1,14 @@
+"""Random cases in Triton's interpreter; on a card those written out, as a kernel is compiled for each size."""
+
+import torch
+from hypothesis import Phase, settings
+
+from geodiff_plugin._kernels import interpreting
+
+_ON_A_CARD = torch.cuda.is_available() and not interpreting()
+
+
+def drawn(most: int) -> settings:
+    """At most so many random cases beside the ``example`` ones, which alone run on a card."""
+    phases = (Phase.explicit,) if _ON_A_CARD else tuple(Phase)
+    return settings(max_examples=most, deadline=None, phases=phases)
