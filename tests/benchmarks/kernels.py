@@ -59,13 +59,12 @@ def launches() -> Iterator[Compiled]:
 
 def _of_the_matching() -> Iterator[Compiled]:
     paths = "*u8 *i16 *i32 i32 i32 i32 i32 i32 i32 i32"
-    for planes in (128, 256, 512, 1024, 2048):
+    for planes in (128, 256, 512, 1024, 2048, 4096):
         axes = {"DOWN": (1, 0, 1, 1), "ACROSS": (0, 1, 1, -1), "PADDED": planes}
-        yield Compiled(
-            f"paths, {planes} planes", matching.paths_kernel, paths, axes, matching.path_warps(planes)
-        )
+        warps = matching.path_warps(planes)
+        yield Compiled(f"paths, {planes} planes", matching.paths_kernel, paths, axes, warps)
     winner = "*i32 *u8 *i1 *fp32 *fp32 *fp32 *fp32" + 9 * " i32"
-    for evidence, padded in ((True, 128), (False, 128), (True, 2048)):
+    for evidence, padded in ((True, 128), (False, 128), (True, 4096)):
         sizes = {"EVIDENCE": evidence, "BLOCK": max(1, 1024 // padded), "PADDED": padded}
         name = f"winner{' and evidence' if evidence else ''}, {padded} planes"
         yield Compiled(name, matching.winner_kernel, winner, sizes, 4)

@@ -1,4 +1,4 @@
-"""Random cases in Triton's interpreter; on a card those written out, as a kernel is compiled for each size."""
+"""Random cases in Triton's interpreter; on a card those written out: sizes are compiled for."""
 
 import torch
 from hypothesis import Phase, settings

@@ -1,12 +1,13 @@
 """How many operations the host sends to a device in a guided call, counted without one."""
 
 import pytest
+import torch
 
-from geodiff_plugin._kernels import has_triton
+from geodiff_plugin._kernels import has_triton, launched_on
 
 #: Operations of a guided call outside its networks that are no views, and kernels, which a GPU is sent one by
 #: one (``python -m tests.benchmarks.launches`` shows them by stage).
-MOST_OPERATIONS, MOST_LAUNCHES = 3500, 200
+MOST_OPERATIONS, MOST_LAUNCHES = 3000, 200
 
 
 @pytest.mark.skipif(not has_triton(), reason="Triton is not installed")
@@ -16,3 +17,22 @@ def test_a_guided_call_sends_few_operations():
     found = count_guided_call(resolution=128, side=224)
     assert 1000 < found.operations.total() - found.views.total() <= MOST_OPERATIONS
     assert 50 < found.launches.total() <= MOST_LAUNCHES
+
+
+def test_a_kernel_is_launched_on_the_device_of_its_tensor(monkeypatch):
+    """Triton launches on the current device, which need not be that of the pipeline."""
+    tensor, seen = torch.zeros(1), []
+
+    class Current:
+        def __init__(self, of):
+            self.of = of
+
+        def __enter__(self):
+            seen.append(self.of)
+
+        def __exit__(self, *error):
+            seen.append("left")
+
+    monkeypatch.setattr(torch.cuda, "device_of", Current)
+    launched_on(tensor, lambda *args, **kwargs: seen.append((args, kwargs)))(1, BLOCK=2)
+    assert seen[0] is tensor and seen[1:] == [((1,), {"BLOCK": 2}), "left"]
