@@ -135,6 +135,17 @@ class PriorOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SpeedOptions:
+    """How networks and stages run on a GPU; results are equal within rounding."""
+
+    graphs: bool = declare(
+        False,
+        "Networks as CUDA graphs, and a faster group norm in half precision (on for many pairs, captures).",
+    )
+    no_kernels: bool = declare(False, "No Triton kernels: every stage in plain torch.")
+
+
+@dataclass(frozen=True, kw_only=True)
 class RunOptions(PriorOptions):
     """How it runs: what ``geodiff depth``, the page and the ComfyUI node have in common."""
 

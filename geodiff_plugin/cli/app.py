@@ -17,7 +17,16 @@ import typer
 from geodiff_plugin.cli.commands import new_group
 from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions, start_pair, with_folder
 from geodiff_plugin.jobs.telling import say, silent
-from geodiff_plugin.options import OUTPUT, SPACES, Command, PriorOptions, declare, help_of, imported
+from geodiff_plugin.options import (
+    OUTPUT,
+    SPACES,
+    Command,
+    PriorOptions,
+    SpeedOptions,
+    declare,
+    help_of,
+    imported,
+)
 
 _out = partial(declare, panel=OUTPUT)
 
@@ -97,6 +106,11 @@ class _Demo:
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Bench(SpeedOptions, PriorOptions):
+    """Both as they are."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Info:
     prior: str | None = declare(None, "Also describe this prior.")
     space: str | None = declare(
@@ -162,7 +176,11 @@ COMMANDS = {
     "capture": Command(CaptureOptions, _capture, "Metric depth of the frames of a capture, and one cloud."),
     "demo": Command(_Demo, _Demo.run, "Run on the bundled pair, whose depth is known, or on real ones."),
     "info": Command(_Info, _later("cli.info.run_info"), "Show versions, devices and priors."),
-    "bench": Command(PriorOptions, _later("cli.demo.run_bench"), "Measure how much time guidance adds."),
+    "bench": Command(
+        _Bench,
+        lambda options: _imported("cli.demo.run_bench")(options),
+        "Measure how much time guidance adds.",
+    ),
     "video": Command(_Video, _later("cli.results.run_video"), "Join the depth maps of frames into a video."),
     "merge": Command(_Merge, _later("cli.results.run_merge"), "Join the tables of shards of many pairs."),
     "submit": Command(_Submit, _later("cli.results.run_submit"), "Write results for Middlebury or ETH3D."),

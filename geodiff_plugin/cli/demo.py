@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -10,10 +11,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, read_demo_pair
 from geodiff_plugin.cli.terminal import new_table, show
@@ -21,19 +25,23 @@ from geodiff_plugin.evaluation.metrics import align, evaluate_depth
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats import atomic_path
 from geodiff_plugin.formats.out import OutFolder
+from geodiff_plugin.jobs.many import depth_pairs
 from geodiff_plugin.jobs.options import DepthOptions, start_pair
 from geodiff_plugin.jobs.pair import depth_pair
+from geodiff_plugin.jobs.pairs import start_many
 from geodiff_plugin.jobs.prior import load_guided_prior, prior_of_options
 from geodiff_plugin.jobs.report import single_map, summary_line
 from geodiff_plugin.jobs.telling import collected_warnings, say, silent
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
-from geodiff_plugin.runtime.guided_call import count_guided_steps
+from geodiff_plugin.runtime.guided_call import count_guided_steps, enable_geometry_guidance
 from geodiff_plugin.runtime.machine import pick_device, timed
 
 CELL_WIDTH = 360
 COMPARISON = "comparison.png"
 #: Calls of which the fastest counts.
 CALLS = 3
+#: Pairs of the folder whose throughput is measured.
+PAIRS = 4
 
 
 def run_demo(options: DepthOptions, out: OutFolder) -> None:
@@ -90,24 +98,72 @@ def run_real_demo(pairs: Sequence[DepthOptions], out: Path) -> None:
     print(f"Open {out / COMPARISON} first: every left image beside its depth.")
 
 
-def run_bench(prior: str, space: str | None, steps: int | None, seed: int, device: str) -> None:
-    """Print seconds of a plain and of a guided call, and where the time of a command goes."""
-    place, pair = pick_device(device), read_demo_pair()
+def run_bench(options: Any) -> None:
+    """Print seconds of a plain and of a guided call, pairs a second, and where the time of a command goes."""
+    place, pair = pick_device(options.device), read_demo_pair()
     where = f"{place}, {torch.get_num_threads()} threads, torch {torch.__version__}"
-    pipe, cameras = load_guided_prior(prior, place, space), (pair.rig.K_left, pair.rig.K_right)
+    pipe, cameras = (
+        load_guided_prior(options.prior, place, options.space),
+        (pair.rig.K_left, pair.rig.K_right),
+    )
+    enable_geometry_guidance(pipe, graphs=options.graphs, kernels=not options.no_kernels)
     guidance = GeometryGuidance(pair.right, cameras, pair.rig.E)
-    count, _ = count_guided_steps(pipe, guidance, steps)
-    generator = torch.Generator("cpu").manual_seed(seed)
+    count, _ = count_guided_steps(pipe, guidance, options.steps)
+    generator = torch.Generator("cpu").manual_seed(options.seed)
     table, fastest = new_table(("", "seconds", "time x")), list[float]()
     for name, given in (("plain", None), ("guided", guidance)):
         call = partial(pipe, pair.left, guidance=given, num_inference_steps=count, generator=generator)
         fastest.append(min(timed(call, place) for _ in range(CALLS)))
         table.add_row(name, f"{fastest[-1]:.2f}", f"{fastest[-1] / fastest[0]:.2f}")
+    title = f"prior {options.prior}, {count} steps, default guidance; {where}; demo pair"
+    show(title, table, _pairs_a_second(options, pipe, count, place), _command_seconds(options, place))
+
+
+def _pairs_a_second(options: Any, pipe: Any, steps: int, place: torch.device) -> str:
+    """Throughput of a folder of demo pairs, read and written: guided by the command, and plain."""
+    with tempfile.TemporaryDirectory() as parent:
+        folder = Path(parent)
+        for side, number in product(("left", "right"), range(PAIRS)):
+            (folder / side).mkdir(exist_ok=True)
+            shutil.copyfile(DEMO_PAIR_FOLDER / f"{side}.png", folder / side / f"{number}.png")
+
+        def plain() -> None:
+            for path in sorted((folder / "left").iterdir()):
+                with Image.open(path) as picture:
+                    depth = pipe(picture.convert("RGB"), num_inference_steps=steps).prediction
+                np.save(path.with_suffix(".npy"), depth)
+                path.with_suffix(".npy").unlink()
+
+        many = DepthOptions(
+            left=folder / "left",
+            right=folder / "right",
+            calib=(DEMO_PAIR_FOLDER / "calib.txt",),
+            steps=options.steps,
+            device=str(place),
+            out=folder / "out",
+            overwrite=True,
+            quiet=True,
+        )
+        refs = start_many(many)
+        seconds = {"guided": 0.0, "plain": 0.0}
+        for name, call in (("guided", lambda: depth_pairs(many, refs, pipe=pipe)), ("plain", plain)):
+            seconds[name] = timed(call, place)
+    rates = {name: PAIRS / each for name, each in seconds.items()}
+    told = ", ".join(f"{name} {rate:.2f}" for name, rate in rates.items())
+    return f"pairs a second of a folder: {told} ({rates['guided'] / rates['plain']:.2f} of plain's)"
+
+
+def _command_seconds(options: Any, place: torch.device) -> str:
+    """Where the time of ``geodiff depth`` goes, in a process of its own."""
     left, right, calib = (str(DEMO_PAIR_FOLDER / name) for name in ("left.png", "right.png", "calib.txt"))
     with tempfile.TemporaryDirectory() as folder:
         flags = ["--calib", calib, "--device", str(place), "--json", "--quiet", "--out", f"{folder}/out"]
-        for flag, value in {"--prior": prior, "--space": space, "--steps": steps, "--seed": seed}.items():
-            flags += [] if value is None else [flag, str(value)]
+        for name in ("prior", "space", "steps", "seed"):
+            value = getattr(options, name)
+            flags += [] if value is None else [f"--{name}", str(value)]
+        flags += [
+            flag for flag, on in (("--graphs", options.graphs), ("--no-kernels", options.no_kernels)) if on
+        ]
         words = [sys.executable, "-m", "geodiff_plugin", "depth", left, right, *flags]
         started = time.perf_counter()
         answer = subprocess.run(words, check=True, capture_output=True, text=True)
@@ -115,5 +171,4 @@ def run_bench(prior: str, space: str | None, steps: int | None, seed: int, devic
     stages: dict[str, float] = json.loads(answer.stdout)["seconds"]
     stages["python"] = whole - sum(stages.values())  # what lies around them
     told = ", ".join(f"{name} {seconds:.1f}" for name, seconds in stages.items())
-    command = f"geodiff depth: {sum(stages.values()):.1f} s ({told})"
-    show(f"prior {prior}, {count} steps, default guidance; {where}; demo pair", table, command)
+    return f"geodiff depth: {sum(stages.values()):.1f} s ({told})"

@@ -15,6 +15,7 @@ from geodiff_plugin.options import (
     OUTPUT,
     Command,
     PriorOptions,
+    SpeedOptions,
     check_engine,
     check_options,
     declare,
@@ -100,7 +101,7 @@ class OutOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalOptions(OutOptions, PriorOptions):
+class EvalOptions(SpeedOptions, OutOptions, PriorOptions):
     """What every command that runs a prior is told."""
 
     dtype: str = declare("float32", f"Number format of the prior: {', '.join(DTYPES)}.", choices=DTYPES)

@@ -41,6 +41,7 @@ from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.options import imported
 from geodiff_plugin.pose.multiview import SolvedCapture
 from geodiff_plugin.runtime.machine import pick_device
+from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from geodiff_plugin.types import MetricDepthOutput
 
 #: File of the solved poses, which an interrupted run reads again.
@@ -171,7 +172,11 @@ def _factor(capture: Capture, options: CaptureOptions) -> float | None:
 
 def _pipe(options: CaptureOptions) -> Any:
     prior = "map" if options.prior_map is not None else options.prior
-    return load_guided_prior(prior, pick_device(options.device), options.space)
+    device = pick_device(options.device)
+    pipe = load_guided_prior(prior, device, options.space)
+    # Frames of a capture mostly have one size, for which recording pays.
+    graphs = options.graphs or device.type == "cuda"
+    return enable_geometry_guidance(pipe, graphs=graphs, kernels=not options.no_kernels)
 
 
 def _depth(

@@ -176,7 +176,12 @@ def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
 
 
 def depth_pairs(
-    options: DepthOptions, refs: Sequence[PairRef], *, tell: Tell = silent, progress: bool = False
+    options: DepthOptions,
+    refs: Sequence[PairRef],
+    *,
+    tell: Tell = silent,
+    progress: bool = False,
+    pipe: Any = None,
 ) -> list[Row]:
     """What ``geodiff depth`` does with many pairs: a folder each below ``options.out``, and ``pairs.csv``.
 
@@ -188,6 +193,7 @@ def depth_pairs(
         refs: of ``start_many`` with the same options.
         tell: takes the lines for the user.
         progress: whether a bar on stderr counts the pairs.
+        pipe: a guided pipeline, in place of the prior that the options name.
 
     Returns:
         A row a pair, in order, with ``COLUMNS``; ``result`` is ``"done"``, ``"there"`` or ``"failed"``.
@@ -212,7 +218,7 @@ def depth_pairs(
                 records = pairs_to_folders(options, items, journal, tell=tell, progress=progress)
             else:
                 runner = Runner(items, journal, noun="pair", survives=(Exception,), progress=progress)
-                records = _through(Stages(options, device, tell=tell), runner)
+                records = _through(Stages(options, device, pipe, tell=tell), runner)
         rows = [_final(record, there.get(record["key"]), options, tell) for record in records]
         write_table(shard.path(options.out / SUMMARY), rows, tell)
         if options.steady:

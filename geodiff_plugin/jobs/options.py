@@ -20,6 +20,7 @@ from geodiff_plugin.options import (
     OUTPUT,
     PriorOptions,
     RunOptions,
+    SpeedOptions,
     check_engine,
     check_options,
     declare,
@@ -69,7 +70,7 @@ class _Exclusion:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthOptions(RunOptions):
+class DepthOptions(SpeedOptions, RunOptions):
     """The options of ``geodiff depth`` as they were typed."""
 
     left: Path = declare(
@@ -187,10 +188,6 @@ class DepthOptions(RunOptions):
         None, "Of many pairs: do part I of N, from 0/N on; geodiff merge joins the tables.", metavar="I/N"
     )
     quiet: bool = _output(False, "Show no progress bar and no summary.", "--quiet", "-q")
-    graphs: bool = declare(
-        False, "Networks as CUDA graphs, and a faster group norm in half precision (on for many pairs)."
-    )
-    no_kernels: bool = declare(False, "No Triton kernels: every stage in plain torch.")
     json: bool = _output(False, "Print the report as JSON instead of the summary.")
 
     def __post_init__(self) -> None:
@@ -398,7 +395,7 @@ def start_pair(options: DepthOptions, photographs: bool = True) -> OutFolder:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CaptureOptions(PriorOptions):
+class CaptureOptions(SpeedOptions, PriorOptions):
     """The options of ``geodiff capture`` as they were typed."""
 
     path: Path = declare(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.jobs.journal import fingerprint
+from geodiff_plugin.options import SpeedOptions
 from geodiff_plugin.priors import load_prior, prior_of
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.priors.loading import no_bars
@@ -52,6 +53,8 @@ class Settings:
     dtype: str = "float32"
     space: str | None = None
     views: int = 2
+    graphs: bool = False
+    no_kernels: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,14 +98,15 @@ class PriorCache:
 
     def get(self, settings: Settings) -> Any:
         """The pipeline of ``settings.prior`` with geometry guidance enabled; errors as ``load_prior``."""
-        key = (settings.prior, settings.device, settings.dtype, settings.space)
+        speed = {"graphs": settings.graphs, "kernels": not settings.no_kernels}
+        key = (settings.prior, settings.device, settings.dtype, settings.space, *speed.values())
         if key not in self._pipes:
             options: dict[str, Any] = {"device": settings.device, "dtype": getattr(torch, settings.dtype)}
             options |= {} if settings.space is None else {"space": settings.space}
             with no_bars():
                 pipe = load_prior(settings.prior, **options)
             pipe.set_progress_bar_config(disable=True)
-            self._pipes[key] = enable_geometry_guidance(pipe)
+            self._pipes[key] = enable_geometry_guidance(pipe, **speed)
         return self._pipes[key]
 
     def fingerprint(self, settings: Settings) -> str:
@@ -181,7 +185,8 @@ def guided_prediction(
 
 
 def _plain_configuration(settings: Settings) -> dict[str, Any]:
-    return {key: value for key, value in asdict(settings).items() if key != "prior"}
+    without = ("prior", *(each.name for each in fields(SpeedOptions)))  # results are equal within rounding
+    return {key: value for key, value in asdict(settings).items() if key not in without}
 
 
 def guided_configuration(preset: Preset, settings: Settings) -> dict[str, Any]:
