@@ -107,7 +107,7 @@ class _Demo:
 
 @dataclass(frozen=True, kw_only=True)
 class _Bench(SpeedOptions, PriorOptions):
-    """Both as they are."""
+    """What ``geodiff bench`` is told."""
 
 
 @dataclass(frozen=True, kw_only=True)

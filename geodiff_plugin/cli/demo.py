@@ -102,12 +102,9 @@ def run_bench(options: Any) -> None:
     """Print seconds of a plain and of a guided call, pairs a second, and where the time of a command goes."""
     place, pair = pick_device(options.device), read_demo_pair()
     where = f"{place}, {torch.get_num_threads()} threads, torch {torch.__version__}"
-    pipe, cameras = (
-        load_guided_prior(options.prior, place, options.space),
-        (pair.rig.K_left, pair.rig.K_right),
-    )
+    pipe = load_guided_prior(options.prior, place, options.space)
     enable_geometry_guidance(pipe, graphs=options.graphs, kernels=not options.no_kernels)
-    guidance = GeometryGuidance(pair.right, cameras, pair.rig.E)
+    guidance = GeometryGuidance(pair.right, (pair.rig.K_left, pair.rig.K_right), pair.rig.E)
     count, _ = count_guided_steps(pipe, guidance, options.steps)
     generator = torch.Generator("cpu").manual_seed(options.seed)
     table, fastest = new_table(("", "seconds", "time x")), list[float]()
@@ -161,9 +158,8 @@ def _command_seconds(options: Any, place: torch.device) -> str:
         for name in ("prior", "space", "steps", "seed"):
             value = getattr(options, name)
             flags += [] if value is None else [f"--{name}", str(value)]
-        flags += [
-            flag for flag, on in (("--graphs", options.graphs), ("--no-kernels", options.no_kernels)) if on
-        ]
+        flags += ["--graphs"] if options.graphs else []
+        flags += ["--no-kernels"] if options.no_kernels else []
         words = [sys.executable, "-m", "geodiff_plugin", "depth", left, right, *flags]
         started = time.perf_counter()
         answer = subprocess.run(words, check=True, capture_output=True, text=True)

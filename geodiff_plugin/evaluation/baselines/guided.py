@@ -94,7 +94,7 @@ class PriorCache:
     """Loads a prior once per run, ready to be guided; ``evidence`` is that of the last pairs."""
 
     def __init__(self) -> None:
-        self.evidence, self._pipes = EvidenceStore(), dict[tuple[str | None, ...], Any]()
+        self.evidence, self._pipes = EvidenceStore(), dict[tuple[str | bool | None, ...], Any]()
 
     def get(self, settings: Settings) -> Any:
         """The pipeline of ``settings.prior`` with geometry guidance enabled; errors as ``load_prior``."""
