@@ -40,8 +40,8 @@ from geodiff_plugin.jobs.writing import write_maps
 from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.options import imported
 from geodiff_plugin.pose.multiview import SolvedCapture
-from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
+from geodiff_plugin.runtime.machine import pick_device
 from geodiff_plugin.types import MetricDepthOutput
 
 #: File of the solved poses, which an interrupted run reads again.
