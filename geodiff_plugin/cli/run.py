@@ -64,7 +64,7 @@ def run_parquet(options: DepthOptions, refs: Sequence[PairRef]) -> None:
     """Many pairs into Parquet files, by Ray; the answer is what it comes to."""
     with collected_warnings():
         to_parquet = imported("jobs.cluster.pairs_to_parquet")
-        result = to_parquet(options, refs, tell=_tell(options), progress=not options.quiet)
+        result = to_parquet(options, refs, progress=not options.quiet)
     if options.json:
         print(json.dumps(asdict(result), indent=2))
     elif not options.quiet:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -28,7 +29,7 @@ from geodiff_plugin.jobs.pairs import PairRef
 from geodiff_plugin.jobs.parquet import Store
 from geodiff_plugin.jobs.ray import Done, Workers, attempt, encoded, guided_refs, on_actors
 from geodiff_plugin.jobs.rows import GuidedPair
-from geodiff_plugin.jobs.telling import Tell, silent
+from geodiff_plugin.jobs.telling import say
 from geodiff_plugin.priors import find_prior
 
 #: Rows of a Parquet file at most: many small files are slow to list and to read.
@@ -55,6 +56,8 @@ def connected() -> Iterator[None]:
     if not Shard.of(None).whole:
         refuse("--engine ray divides the work by itself: start it once, without RANK and WORLD_SIZE.")
     with ExitStack() as undo:
+        undo.enter_context(warnings.catch_warnings())
+        warnings.filterwarnings("ignore", module=r"ray\.")  # such as that there are fewer blocks than tasks
         if not ray.is_initialized():
             _start_ray(undo)
         logging.getLogger("ray.data").setLevel(logging.CRITICAL)
@@ -72,8 +75,8 @@ def _start_ray(undo: ExitStack) -> None:
     if BACKEND_LOG_LEVEL not in os.environ:
         os.environ[BACKEND_LOG_LEVEL] = "fatal"
         undo.callback(os.environ.pop, BACKEND_LOG_LEVEL)
-    quiet = {"log_to_driver": False, "logging_level": logging.ERROR, "include_dashboard": False}
-    here = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": available_cores()}
+    quiet: Row = {"log_to_driver": False, "logging_level": logging.ERROR, "include_dashboard": False}
+    here: Row = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": available_cores()}
     ray.init(**quiet, **here)
     undo.callback(ray.shutdown)
 
@@ -154,12 +157,7 @@ def items_on_actors(
 
 
 def pairs_to_folders(
-    options: DepthOptions,
-    items: Sequence[Item],
-    journal: Journal,
-    *,
-    tell: Tell = silent,
-    progress: bool = False,
+    options: DepthOptions, items: Sequence[Item], journal: Journal, *, progress: bool = False
 ) -> list[Record]:
     """The records of pairs, each in a folder of its own, as one process makes them.
 
@@ -167,7 +165,6 @@ def pairs_to_folders(
         options: of the command, with ``engine="ray"``.
         items: whose payload is a ``PairRef``.
         journal: of the job.
-        tell: takes the lines for the user.
         progress: whether a bar on stderr counts the pairs.
 
     Raises:
@@ -183,7 +180,7 @@ def pairs_to_folders(
             yield Done(key, row if error is None else None, error)
 
     with connected():
-        return _recorded(items, journal, work, Failures(len(items), "pair", tell), progress)
+        return _recorded(items, journal, work, Failures(len(items), "pair", say), progress)
 
 
 def _write_folder(row: Row) -> Row:
@@ -222,21 +219,20 @@ class ParquetResult:
 
 
 def pairs_to_parquet(
-    options: DepthOptions, refs: Sequence[PairRef], *, tell: Tell = silent, progress: bool = False
+    options: DepthOptions, refs: Sequence[PairRef], *, progress: bool = False
 ) -> ParquetResult:
     """Metric depth of many pairs into the Parquet files of ``options.out``, a folder or a URI.
 
     Args:
         options: of the command, with ``engine="ray"``.
         refs: of ``start_many``.
-        tell: takes the lines for the user.
         progress: whether a bar on stderr counts the pairs.
 
     Raises:
         InputError: all pairs fail for one reason; no such prior; results of other options; a full disk.
     """
     find_prior(options.prior)
-    store, failures = Store.of(options), Failures(len(refs), "pair", tell)
+    store, failures = Store.of(options), Failures(len(refs), "pair", say)
     with connected():
         keys = store.begin(_alone(options))
         left = [ref for ref in refs if ref.name not in keys]

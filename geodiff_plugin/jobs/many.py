@@ -215,7 +215,7 @@ def depth_pairs(
         with _nothing_left_if_all_fail(journal):
             if options.engine == "ray":
                 pairs_to_folders = imported("jobs.cluster.pairs_to_folders")
-                records = pairs_to_folders(options, items, journal, tell=tell, progress=progress)
+                records = pairs_to_folders(options, items, journal, progress=progress)
             else:
                 runner = Runner(items, journal, noun="pair", survives=(Exception,), progress=progress)
                 records = _through(Stages(options, device, pipe, tell=tell), runner)

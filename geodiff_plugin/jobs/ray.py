@@ -80,7 +80,7 @@ class Workers:
 
     def for_rows(self, rows: int) -> Workers:
         """No more of them than there are rows."""
-        return self if self.count is None else replace(self, count=max(1, min(self.count, rows)))
+        return self if self.most() <= rows else replace(self, count=max(1, rows))
 
     def stages_beside(self) -> Row:
         """Arguments of ``Dataset.map`` for a stage of tasks that feed these actors, or take what they give.
@@ -92,7 +92,7 @@ class Workers:
 
     def arguments(self) -> Row:
         """Arguments of ``Dataset.map`` that ask Ray for these actors."""
-        size = {"min_size": 1, "max_size": self.most()} if self.count is None else {"size": self.count}
+        size: Row = {"min_size": 1, "max_size": self.most()} if self.count is None else {"size": self.count}
         compute = ray.data.ActorPoolStrategy(**size)
         return {"compute": compute, "num_cpus": GUIDE_CPUS, "num_gpus": self._gpus() or None}
 
@@ -141,11 +141,12 @@ def guided_refs(refs: Sequence[PairRef], options: DepthOptions, workers: Workers
         options: of the command.
         workers: the actors, which the blocks of rows are enough to keep busy.
     """
+    workers = workers.for_rows(len(refs))
     each = min(MOST_ROWS, max(1, len(refs) // (4 * workers.most())))
     blocks = min(MOST_BLOCKS, ceil(len(refs) / each))
     rows = [{"key": ref.name, STATE: pickle.dumps(ref)} for ref in refs]
     ds = ray.data.from_items(rows, override_num_blocks=blocks)
-    return _guided(ds, partial(_read_ref, options), options, workers.for_rows(len(refs)))
+    return _guided(ds, partial(_read_ref, options), options, workers)
 
 
 def _guided(ds: Any, read: Callable[[Row], ReadPair], options: DepthOptions, workers: Workers) -> Any:
@@ -263,7 +264,7 @@ def on_actors(
     Each actor calls ``make`` once, which returns the function from a key to its record.
     """
     blocks = min(len(keys), MOST_BLOCKS)
-    rows = ray.data.from_items([{"key": key} for key in keys], override_num_blocks=blocks)
+    rows: Any = ray.data.from_items([{"key": key} for key in keys], override_num_blocks=blocks)
     arguments = workers.for_rows(len(keys)).arguments()
     for row in rows.map(_Worker, fn_constructor_args=(make,), **arguments).iter_rows():
         record = pickle.loads(row[STATE]) if row["error"] is None else None

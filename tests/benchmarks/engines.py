@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 import time
@@ -25,6 +26,10 @@ from geodiff_plugin.jobs.pairs import PairRef
 
 #: Seconds between two looks at a command: short beside a pair, long beside a look.
 INTERVAL_S = 0.25
+#: One thread for each process that computes, and none nicer than another: Ray's are nice by 15 without it.
+ENVIRONMENT = {"OMP_NUM_THREADS": "1", "RAY_worker_niceness": "0"}
+#: Pairs that are rendered; all further ones repeat them, as a pair costs the same whatever the others are.
+RENDERED = 24
 #: Pairs whose list is measured.
 LISTED = 100_000
 
@@ -90,7 +95,7 @@ def watch(words: list[str], out: Path, done: Callable[[Path], int]) -> Watch:
     Raises:
         RuntimeError: the command failed; its last lines.
     """
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment = os.environ | ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-m", "geodiff_plugin", *words, "--out", str(out)]
     seen, started = Watch(), time.perf_counter()
     with open(out.with_suffix(".log"), "w+") as log:
@@ -102,6 +107,15 @@ def watch(words: list[str], out: Path, done: Callable[[Path], int]) -> Watch:
             log.seek(0)
             raise RuntimeError("".join(log.readlines()[-5:]))
     return seen
+
+
+def repeat_pairs(options: DepthOptions, count: int) -> None:
+    """Copy the pairs that are there under further names, until there are so many."""
+    for folder in (options.left, options.right):
+        assert folder is not None
+        rendered = sorted(folder.iterdir())
+        for number in range(len(rendered), count):
+            shutil.copy(rendered[number % len(rendered)], folder / f"{number:06}.png")
 
 
 def bytes_of_a_listed_pair() -> int:

@@ -120,10 +120,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, default=2, help="of Ray")
     options = parser.parse_args(arguments)
     if options.engine == "ray":
-        from tests.benchmarks.engines import compare_engines  # of the extra ray
+        from tests.benchmarks.engines import RENDERED, compare_engines, repeat_pairs  # ray
 
         with tempfile.TemporaryDirectory() as folder:
-            typed = write_pairs(Path(folder), options.pairs, tuple(options.size))
+            typed = write_pairs(Path(folder), min(options.pairs, RENDERED), tuple(options.size))
+            repeat_pairs(typed, options.pairs)
             typed = replace(typed, device=options.device, prior=options.prior)
             compare_engines(typed, options.pairs, options.workers, Path(folder))
         return

@@ -31,11 +31,16 @@ from geodiff_plugin.jobs.options import DepthOptions  # noqa: E402
 from geodiff_plugin.jobs.ray import Workers, depth_dataset  # noqa: E402
 from geodiff_plugin.jobs.rows import COLUMNS  # noqa: E402
 from tests.benchmarks.many import write_pairs  # noqa: E402
+from tests.evaluating import write_scenes  # noqa: E402
+from tests.unit.capture_room import render, walk, write_transforms  # noqa: E402
 
 PAIRS, FEW, SIZE = 24, 8, (64, 96)
+FRAMES = walk(10)[3:7]
 QUICK = "--steps 1 --preset paper --device cpu -q".split()
 RAY = ["--engine", "ray", "--workers", "2"]
 LAYOUTS = ("folders", "parquet")
+#: Of every process that computes. Ray's own are nice by 15, and would starve where the machine is busy.
+ENVIRONMENT = {"OMP_NUM_THREADS": "1", "RAY_worker_niceness": "0"}
 #: Begins what a process of Ray that holds the prior calls itself.
 ACTOR = "ray::MapWorker"
 
@@ -66,7 +71,7 @@ class Pairs(NamedTuple):
 def start(words: list[str]) -> subprocess.Popen:
     """A command in a process of its own, which starts a Ray of its own if it needs one."""
     environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
-    environment |= {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment |= ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-m", "geodiff_plugin", *words]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, env=environment, process_group=0, **pipes)
@@ -81,8 +86,9 @@ def alone(words: list[str]) -> Answer:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[None]:
     """A Ray with two CPUs, whose processes the commands of this process share."""
-    before = {name: os.environ.get(name) for name in ("OMP_NUM_THREADS", "PYTHONPATH")}
-    os.environ |= {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    ours = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    before = {name: os.environ.get(name) for name in ours}
+    os.environ |= ours
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
     yield
     ray.shutdown()
@@ -266,7 +272,7 @@ def test_broken_rows_are_rows_with_an_error_and_the_rest_is_done(few, cluster, t
 
 
 def test_what_holds_for_all_pairs_is_said_once_and_leaves_no_folder(few, cluster, tmp_path):
-    words = [*few.words()[:3], "--calib", str(few.folder / "left" / "000000.png"), *QUICK]
+    words = few._replace(cameras=few.cameras | {"cx": 5000.0}).words()
     answer = call([*words, *RAY, "--as", "folders", "--out", str(tmp_path / "out")])
     assert answer.code == 2 and "The same holds for all 8 pairs" in answer.err, answer.err
     assert not (tmp_path / "out").exists()
@@ -392,15 +398,49 @@ def test_the_job_is_not_divided_twice(few, cluster, monkeypatch, tmp_path):
 
 
 def test_cells_of_an_evaluation_are_those_of_one_process(cluster, tmp_path):
-    words = ["eval", "pairs", "demo", "--methods", "sgbm,guided", "--steps", "1", "-q"]
+    scenes = str(write_scenes(tmp_path / "scenes", "hall", "yard"))
+    words = [
+        "eval",
+        "pairs",
+        scenes,
+        "--methods",
+        "sgbm,search-only",
+        "--steps",
+        "1",
+        "--device",
+        "cpu",
+        "-q",
+    ]
     records = []
     for engine in ([], RAY):
         out = tmp_path / f"{len(records)}"
         answer = call([*words, *engine, "--out", str(out)])
         assert answer.code == 0, answer.err
         lines = (out / "samples.jsonl").read_text().splitlines()
-        records.append({(r := json.loads(line))["key"]: r["raw"] for line in lines})
-    assert records[0] == records[1] and len(records[0]) == 2
+        records.append({(r := json.loads(line))["key"]: r["all_pixels"] for line in lines})
+    assert records[0] == records[1] and len(records[0]) == 4
+
+
+def test_frames_of_a_capture_are_those_of_one_process(cluster, tmp_path):
+    pytest.importorskip("pycolmap")
+    write_transforms(tmp_path / "scan", FRAMES, FRAMES)
+    (tmp_path / "maps").mkdir()
+    for number, E in enumerate(FRAMES):
+        np.save(tmp_path / f"maps/f{number:02d}.npy", render(E)[1].astype(np.float32))
+    words = ["capture", str(tmp_path / "scan"), "--prior-map", str(tmp_path / "maps"), "--frames", "f01,f02"]
+    words += ["--poses", "given", *"--steps 1 --neighbours 1 --device cpu -q".split()]
+    for name, engine in {"one": ["--processes", "1"], "ray": RAY}.items():
+        answer = call([*words, *engine, "--out", str(tmp_path / name)])
+        assert answer.code in (0, 4), answer.err
+    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "ray").glob("*/depth_alone.npy")}
+    assert len(made) == 2
+    for path in made:
+        assert path.read_bytes() == (tmp_path / "one" / path.relative_to(tmp_path / "ray")).read_bytes()
+    (tmp_path / "ray" / "f02" / "depth_alone.npy").unlink()
+    answer = call([*words, *RAY, "--out", str(tmp_path / "ray")])
+    assert answer.code in (0, 4), answer.err
+    again = [path.parent.name for path, time_ns in made.items() if path.stat().st_mtime_ns != time_ns]
+    assert again == ["f02"]
 
 
 def test_options_of_a_pair_are_those_of_a_run_without_ray(few):
