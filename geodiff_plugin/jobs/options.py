@@ -303,7 +303,7 @@ class DepthOptions(SpeedOptions, RunOptions):
             ),
             _Exclusion(
                 self.engine == "ray" and self.layout != "folders",
-                ("steady", "export"),
+                ("steady", "export", "into"),
                 "{} needs --as folders where the engine is Ray.",
             ),
             _Exclusion(not posed, ("calib", "cameras", "e", "view_e", "cx_right"), f"{with_poses}, {for_k}"),
