@@ -479,6 +479,19 @@ MESSAGES: dict[str, MessageKind] = {
         cause="The matches contradict the poses as written.",
         cure="Nothing if the convention that the message names is right.",
     ),
+    "capture.convention-unsure": MessageKind(
+        "The convention of the poses is not known",
+        cause="None fits the matches: under the one that fits best they lie far off their epipolar lines.",
+        cure="Give camera-to-world poses of these pictures, in the axes of OpenCV or OpenGL.",
+        forbids_trust=True,
+    ),
+    "capture.turned": MessageKind(
+        "The pictures are turned against their cameras",
+        cause="They are stored in another orientation than the one that the poses and K are for, or were "
+        "turned since.",
+        cure="Turn the pictures as the message says, or give poses and K of the pictures as they are stored.",
+        forbids_trust=True,
+    ),
     "capture.focal": MessageKind(
         "The focal length that fits best is far from the given one",
         cause="K is of another image size, or the motion does not determine the focal length.",
@@ -496,8 +509,9 @@ MESSAGES: dict[str, MessageKind] = {
     ),
     "capture.scale": MessageKind(
         "The scale of the capture is uncertain",
-        cause="Its estimates vary from frame to frame.",
-        cure="Give a known length (--known-length).",
+        cause="Its estimates vary from frame to frame, or trajectory and depth of the scene disagree.",
+        cure="Give a known length (--known-length) or a distance (--distance).",
+        forbids_trust=True,
     ),
     "capture.wrong-poses": MessageKind(
         "Given poses of some frames are wrong",

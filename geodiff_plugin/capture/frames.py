@@ -52,7 +52,9 @@ class Capture:
 
     ``frames`` are in order, with ``names``; ``kind`` is their layout, ``unit`` ``"m"``, or ``None`` where no
     length is known; ``notes`` are for the user; ``solved`` is the result of ``solve``; ``metres_per_unit`` is
-    by what ``rescale`` has multiplied the lengths that the capture came with.
+    by what ``rescale`` has multiplied the lengths that the capture came with. ``scale_measured`` is to be set
+    where that factor is from a measured length: then an uncertain scale of the poses is no reason against
+    trust.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class Capture:
             bad_value("the frames", "of different names", ", ".join(self.names))
         self.metres_per_unit = 1.0
         self.solved: SolvedCapture | None = None
+        self.scale_measured = False
         self._way: str | None = None  # how it was solved
         self._video: VideoReader | None = None
 
@@ -141,6 +144,13 @@ class Capture:
             )
         return self.solved
 
+    @property
+    def doubts(self) -> list[Message]:
+        """Messages on the capture and its poses, each of which forbids trust in the depth of every frame."""
+        notes = [note for note in (*self.notes, *self.solve().notes) if note.forbids_trust]
+        known = self.scale_measured or self.unit is None
+        return [note for note in notes if not (known and note.code == "capture.scale")]
+
     def rescale(self, factor: float) -> None:
         """Multiply all lengths, which then are metres, by a factor above 0."""
         check_number(factor, "metres per unit", 1e-12, 1e12)
@@ -191,7 +201,9 @@ class Capture:
         views += [(self.image(self.names[j]), solved.K[j], solved.pose(i, j)) for j in rights]
         settings = {"pose": "given"} if solved.status in ADJUSTED else {}
         size = self.frame(name).size
-        return GeometryGuidance.from_views(views, left_size=size, unit=self.unit, **settings | knobs)
+        guidance = GeometryGuidance.from_views(views, left_size=size, unit=self.unit, **settings | knobs)
+        guidance.warned = [*self.doubts, *guidance.warned]
+        return guidance
 
     def check_points(self, points: str, scaled: bool = False) -> None:
         """``InputError`` where no frame has such known depths, or they will not be in metres (``scaled``)."""

@@ -93,6 +93,7 @@ def solved_poses(
         solved = capture.solve(options.poses, threads=available_cores())
         _save_solved(path, solved, key)
     capture.solved = solved
+    capture.scale_measured = (options.known_length or options.distance) is not None
     factor = _factor(capture, options) if factor is None else factor
     if factor is not None:
         capture.rescale(factor)

@@ -12,15 +12,16 @@ import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.messages import Message
+from geodiff_plugin.pose.conventions import find_convention, median_px, noted_convention, residuals_px
 from geodiff_plugin.pose.reconstruction import FEWEST_FOR_FOCAL, Match, Reconstruction, pycolmap
+from geodiff_plugin.pose.refine import DEPTH_SPREAD, LENGTH_SPREAD
 
 #: A frame is matched with so many frames after it.
 AFTER = 6
@@ -38,8 +39,6 @@ ROUNDS = ((20.0, 4.0), (8.0, 2.0), (3.0, 1.0))
 MOST_FOCAL = 0.15
 #: A solve must leave less than this share of the residual of the given poses, or they are kept.
 LEAST_GAIN = 0.9
-#: Matches of a pair that its residual is taken from, at most.
-MOST_PER_PAIR = 100
 #: Fewest matches of a frame that say which poses fit it.
 FEWEST_PER_FRAME = 50
 #: A scale from the trajectory is never known better than this: frames share errors that no spread shows.
@@ -48,8 +47,8 @@ SCALE_FLOOR_TRAJECTORY = 0.02
 SCALE_FLOOR_DEPTH = 0.015
 #: Both scales are called in disagreement beyond this.
 DISAGREES = 0.1
-#: Another convention of the given poses is taken where it leaves this share of their misfit at most.
-CONVENTION_GAIN = 0.5
+#: A scale that is less certain than this is not trusted, as that of a refined pose of one pair.
+MOST_SCALE_SPREAD = 0.1
 #: A given position is reported as wrong if the solve moves it this many times as far as the median one.
 FAR_TIMES = 10.0
 #: It also moves it by this share of the size of the trajectory, so that exact poses are not reported.
@@ -159,78 +158,31 @@ def candidate_pairs(E: np.ndarray | None, count: int) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _residuals_px(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> list[np.ndarray]:
-    """Distances of the matches of every pair from their epipolar lines under poses, pixels."""
-    distances = []
-    for i, j, px_i, px_j in matches:
-        step = max(1, len(px_i) // MOST_PER_PAIR)
-        T = np.linalg.inv(E[j]) @ E[i]
-        x, y, z = T[:3, 3]
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        F = np.linalg.inv(K[j]).T @ cross @ T[:3, :3] @ np.linalg.inv(K[i])
-        a, b = (np.c_[px[::step], np.ones(len(px[::step]))] for px in (px_i, px_j))
-        Fa, Fb = a @ F.T, b @ F
-        below = np.sqrt((Fa[:, :2] ** 2).sum(1) + (Fb[:, :2] ** 2).sum(1))
-        distances.append(np.abs((b * Fa).sum(1)) / np.maximum(below, 1e-12))
-    return distances
-
-
-def _median_px(distances: Sequence[np.ndarray]) -> float:
-    return float(np.median(np.concatenate(distances))) if distances else math.nan
-
-
 def _of_frames(matches: Sequence[Match], distances: Sequence[np.ndarray], count: int) -> np.ndarray:
     """``(N,)`` median distance over the matches of every frame; NaN where it has too few."""
     parts: list[list[np.ndarray]] = [[] for _ in range(count)]
     for (i, j, *_), distance in zip(matches, distances, strict=True):
         parts[i].append(distance)
         parts[j].append(distance)
-    return np.array([_median_px(p) if sum(map(len, p)) >= FEWEST_PER_FRAME else math.nan for p in parts])
+    return np.array([median_px(p) if sum(map(len, p)) >= FEWEST_PER_FRAME else math.nan for p in parts])
 
 
 def _in_convention(base: Reconstruction, E: np.ndarray, notes: list[Message]) -> np.ndarray:
     """The given poses in our convention, found by the residuals of the matches."""
-    matches = base.matches[:: max(1, len(base.matches) // 200)]
-    if not matches:
+    if not base.matches:
         sentence = "No two frames match: are they of one scene, and sharp? The poses were not checked."
         notes.append(Message("capture.no-matches", sentence))
         return E
-    forms = {
-        "as given": E,
-        "with OpenGL's axes (y up, z backward)": E @ OPENGL_FROM_OPENCV,
-        "world-to-camera": np.linalg.inv(E),
-        "world-to-camera with OpenGL's axes": np.linalg.inv(OPENGL_FROM_OPENCV @ E),
-    }
-    misfit = {name: _misfit(form, base.K_given, matches) for name, form in forms.items()}
-    best = min(misfit, key=lambda name: misfit[name])
-    if not misfit[best] < CONVENTION_GAIN * misfit["as given"]:
-        return E
-    sentence = f"The poses are read as {best}: as written, the matches contradict them."
-    notes.append(Message("capture.convention", sentence))
-    return forms[best]
-
-
-def _misfit(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> float:
-    """Median residual of matches under poses, pixels, over the share of points in front of both cameras."""
-    ahead, count = 0, 0
-    for i, j, px_i, px_j in matches:
-        T = np.linalg.inv(E[j]) @ E[i]
-        a, b = (np.linalg.solve(k, np.c_[px, np.ones(len(px))].T).T for k, px in ((K[i], px_i), (K[j], px_j)))
-        a = a @ T[:3, :3].T
-        # z_j b = z_i a + t, in the least squares sense, for both depths.
-        aa, bb, ab = (a * a).sum(1), (b * b).sum(1), (a * b).sum(1)
-        at, bt = a @ T[:3, 3], b @ T[:3, 3]
-        below = aa * bb - ab**2
-        ahead += int(((ab * bt > bb * at) & (aa * bt > ab * at) & (below > 0)).sum())
-        count += len(a)
-    return _median_px(_residuals_px(E, K, matches)) / max(ahead / max(count, 1), 0.05)
+    found = find_convention(E, base.K_given, base.matches)
+    notes += noted_convention(found)
+    return found.E
 
 
 def _from_given(base: Reconstruction, given: np.ndarray, notes: list[Message], refine: bool) -> SolvedCapture:
     """Triangulate by the given poses, adjust, triangulate again; keep what is better, frame by frame."""
     matches = base.matches
-    before = _residuals_px(given, base.K_given, matches)
-    as_given = (_median_px(before),) * 2
+    before = residuals_px(given, base.K_given, matches)
+    as_given = (median_px(before),) * 2
 
     def started() -> Any:
         return base.triangulated(base.model(given), ROUNDS[0][0])
@@ -245,12 +197,12 @@ def _from_given(base: Reconstruction, given: np.ndarray, notes: list[Message], r
         sentence = "The focal length that fits best is far from the given one, which is kept."
         notes.append(Message("capture.focal", sentence))
         model = _adjusted(base, started(), given, False)
-    after = _residuals_px(base.poses(model), base.K(model), matches)
-    if not _median_px(after) < LEAST_GAIN * as_given[0]:
+    after = residuals_px(base.poses(model), base.K(model), matches)
+    if not median_px(after) < LEAST_GAIN * as_given[0]:
         sentence = f"The given poses fit as well as any ({as_given[0]:.2f} px) and are kept."
         notes.append(Message("capture.kept", sentence))
         return replace(_result(base, started(), "kept", given, as_given), E=given)
-    result = _result(base, model, "solved", given, (as_given[0], _median_px(after)))
+    result = _result(base, model, "solved", given, (as_given[0], median_px(after)))
     worse = _of_frames(matches, after, len(base)) > _of_frames(matches, before, len(base))
     result = replace(result, connected=result.connected & ~worse)
     return _scaled(result, by_given, base.depths(model))
@@ -281,13 +233,16 @@ def _scaled(
         known = ratios[kept][np.isfinite(ratios[kept])]
         return float(np.median(known)) if len(known) else 0.0
 
+    def of_trajectory(kept: np.ndarray) -> float:
+        return math.log(_similarity(centres[kept], given[kept])[0])
+
     blocks = np.array_split(np.arange(len(centres)), min(8, len(centres)))
-    depth = _jackknifed(middle, blocks) if np.isfinite(ratios).any() else (0.0, math.inf)
-    trajectory = _jackknifed(lambda kept: math.log(_similarity(centres[kept], given[kept])[0]), blocks)
-    spreads = [math.hypot(depth[1], SCALE_FLOOR_DEPTH), math.hypot(trajectory[1], SCALE_FLOOR_TRAJECTORY)]
-    weights = np.array([s**-2.0 if math.isfinite(s) else 0.0 for s in spreads])
-    values = np.nan_to_num([depth[0], trajectory[0]])
-    scale = math.exp(float((weights * values).sum() / max(weights.sum(), 1e-12)))
+    depth = _Estimate(0.0, math.inf)
+    if np.isfinite(ratios).any():
+        depth = _jackknifed(middle, blocks, DEPTH_SPREAD).not_below(SCALE_FLOOR_DEPTH)
+    trajectory = _jackknifed(of_trajectory, blocks, LENGTH_SPREAD).not_below(SCALE_FLOOR_TRAJECTORY)
+    both = _combined(depth, trajectory)
+    scale = math.exp(both.value)
     # Directions of view count three times as much as places: places on a line leave a turn about it open.
     reach = 3.0 * float(np.median(np.linalg.norm(given - np.median(given, axis=0), axis=1)))
     known = (scale * centres, result.E), (given, result.E_given)
@@ -300,22 +255,45 @@ def _scaled(
         result,
         E=E,
         points=scale * result.points @ Q.T + shift,
-        scale_trajectory=math.exp(trajectory[0]),
-        scale_depth=math.exp(depth[0]),
-        scale_spread=float(weights.sum() ** -0.5),
+        scale_trajectory=math.exp(trajectory.value),
+        scale_depth=math.exp(depth.value),
+        scale_spread=both.spread,
     )
 
 
+class _Estimate(NamedTuple):
+    """The log of a scale, and its standard error."""
+
+    value: float
+    spread: float
+
+    def not_below(self, floor: float) -> _Estimate:
+        return self._replace(spread=math.hypot(self.spread, floor))
+
+
+def _combined(a: _Estimate, b: _Estimate) -> _Estimate:
+    """The mean weighted by the inverse variances, and its standard error with what the two disagree by."""
+    weights = np.array([a.spread, b.spread]) ** -2.0
+    shares = weights / weights.sum()
+    value = float(shares @ (a.value, b.value))
+    disagreement = math.sqrt(float(shares.prod())) * abs(a.value - b.value)
+    return _Estimate(value, math.hypot(float(weights.sum() ** -0.5), disagreement))
+
+
 def _jackknifed(
-    statistic: Callable[[np.ndarray], float], blocks: Sequence[np.ndarray]
-) -> tuple[float, float]:
-    """A statistic of all frames and its standard error, by leaving out one stretch of frames at a time."""
+    statistic: Callable[[np.ndarray], float], blocks: Sequence[np.ndarray], of_two: float
+) -> _Estimate:
+    """A statistic of all frames and its standard error, by leaving out one stretch of frames at a time.
+
+    That of two frames, of which none can be left out, is ``of_two``.
+    """
     every = np.concatenate(blocks)
     value = statistic(every)
     if len(blocks) < 3:
-        return value, math.inf
+        return _Estimate(value, of_two)
     left = np.array([statistic(np.setdiff1d(every, block)) for block in blocks])
-    return value, float(np.sqrt((len(blocks) - 1) / len(blocks) * ((left - left.mean()) ** 2).sum()))
+    variance = (len(blocks) - 1) / len(blocks) * ((left - left.mean()) ** 2).sum()
+    return _Estimate(value, math.sqrt(float(variance)))
 
 
 def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
@@ -368,7 +346,7 @@ def _noted(result: SolvedCapture, notes: list[Message], names: Sequence[str]) ->
             f"{100 * abs(ratio - 1):.0f} % apart; their mean is used. Give --known-length for an exact one."
         )
         notes.append(Message("capture.scales", sentence))
-    if spread > DISAGREES:
+    if spread > MOST_SCALE_SPREAD:
         sentence = f"The scale is uncertain by {100 * spread:.0f} %: give --known-length for an exact one."
         notes.append(Message("capture.scale", sentence))
     if result.status == "solved" and result.E_given is not None:
@@ -398,7 +376,7 @@ def _from_nothing(base: Reconstruction, notes: list[Message]) -> SolvedCapture:
         bad_value("the frames", "connected by matches", "no two that are", cure)
     E, K = base.poses(models[0]), base.K(models[0])
     there = np.isfinite(E).all((1, 2))
-    after = _median_px(_residuals_px(E, K, [m for m in base.matches if there[[m.i, m.j]].all()]))
+    after = median_px(residuals_px(E, K, [m for m in base.matches if there[[m.i, m.j]].all()]))
     if len(models) > 1:
         sentence = f"{len(models)} parts are not connected; the largest is used."
         notes.append(Message("capture.parts", sentence))

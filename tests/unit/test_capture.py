@@ -302,6 +302,28 @@ def test_one_length_gives_all_and_without_one_nothing_says_metres(way, model, tm
     assert run.load_solved(tmp_path / "out/poses.npz", "") is None
 
 
+def test_a_doubt_about_the_poses_is_one_about_every_frame(tmp_path, monkeypatch):
+    source = write_transforms(tmp_path, TRUE, GIVEN)
+    uncertain = Message("capture.scale", "The scale is uncertain by 17 %.")
+    turned = Message("capture.turned", "The pictures are turned by 180 degrees.")
+    notes = (Message("capture.scales", "Scales are 41 % apart."), uncertain, turned)
+    monkeypatch.setattr(SOLVE, lambda *_, **__: replace(solved(), notes=notes))
+    capture = Capture.open(source)
+    assert capture.doubts == [uncertain, turned]
+    assert [message for message in capture.guidance("f04").warned if message.forbids_trust] == capture.doubts
+    capture.scale_measured = True
+    assert capture.doubts == [turned]
+    capture.scale_measured, capture.unit = False, None
+    assert capture.doubts == [turned], "what has no unit has no scale"
+
+
+def test_pictures_that_were_turned_are_named():
+    images = [np.rot90(grey(E), 2).copy() for E in TRUE]
+    found = solve(GIVEN, images)
+    (note,) = (note for note in found.notes if note.code == "capture.turned")
+    assert "180 degrees" in note and turn_error_deg(found.E @ np.diag([-1.0, -1.0, 1.0, 1.0])) < 0.5
+
+
 def test_notes_of_saved_poses_keep_their_codes(tmp_path):
     notes = Message("capture.kept", "They fit."), Message("capture.parts", "2 parts.")
     for noted in (notes, ()):
