@@ -374,6 +374,19 @@ MESSAGES: dict[str, MessageKind] = {
         cure="Check these in this order; overview.png shows where the views disagree.",
         forbids_trust=True,
     ),
+    "views.behind-infinity": MessageKind(
+        "Matches lie behind infinity",
+        cause="cx of the right camera is not what K says, the rotation of E is wrong, the right image was "
+        "cropped or stretched, or things moved between the photographs.",
+        cure="Give the right camera's own K (K_right, --K-right, --cx-right); check E and the right image.",
+        forbids_trust=True,
+    ),
+    "views.distorted": MessageKind(
+        "The pictures are not free of lens distortion",
+        cause="They are the camera's own, and the calibration comes without its distortion.",
+        cure="Rectify the pictures, or give a calibration that holds the distortion.",
+        forbids_trust=True,
+    ),
     "views.overlap": MessageKind(
         "The views overlap little",
         cause="A small share of the left image is seen by a right camera.",

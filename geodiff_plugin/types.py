@@ -82,6 +82,8 @@ class PoseReport:
     matches: tuple[float, ...] = ()  # number of matches of each right view
     straightened_px: tuple[float, ...] = ()  # root mean square displacement of the right images; 0 for none
     scale_spread: float | None = None  # relative, of the scale of refined poses; None for measured baselines
+    behind_infinity: float = math.nan  # share of the matches at which the rays of the poses as used diverge
+    distortion: float = math.nan  # radial coefficient k1 that both pictures still have for certain
     warnings: tuple[Message, ...] = ()
 
 
@@ -150,6 +152,8 @@ class Indicators:
     epipolar_px: float = math.nan  # median distance of matches from their epipolar lines, the worst view's
     given_px: float = math.nan  # the same distance under the poses as given
     scale_spread: float = math.nan  # relative standard deviation of a refined pose's scale, if in metres
+    behind_infinity: float = math.nan  # share of the matches at which the two cameras' rays diverge
+    distortion: float = math.nan  # k1 that both pictures still have for certain
     off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
     doubts: tuple[Message, ...] = ()  # warnings about the input, each of which forbids trust
     mistakes: tuple[Message, ...] = ()  # of a given pose, that would explain its misfit (``pose.mistakes``)

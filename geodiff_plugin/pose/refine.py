@@ -15,12 +15,14 @@ import torch
 from torch import Tensor
 
 from geodiff_plugin.messages import Message, distinct
+from geodiff_plugin.pose.lens import remaining_distortion
 from geodiff_plugin.pose.mistakes import find_mistake, pose_change
 from geodiff_plugin.pose.solve import is_rig, nearby_poses, settle_poses
 from geodiff_plugin.pose.tracks import (
     FEWEST,
     Tracks,
     across_lines,
+    behind_infinity,
     coarse_depth,
     dense_tracks,
     grey_views,
@@ -117,6 +119,8 @@ def refine_views(
     fits_px = FITS_PX if rig else POSED_FITS_PX
     fits = not (before > fits_px).any()
     near = given if fits else nearby_poses(sparse, given, before)
+    distortion = remaining_distortion(sparse.view(0), given[0])
+    report = replace(report, behind_infinity=behind_infinity(sparse, given), distortion=distortion)
     if mistakes := _messages(sparse, find_mistake, given, near):
         return tuple(rights), replace(report, status="mistaken", warnings=mistakes)
     if fits:
@@ -161,6 +165,7 @@ def _refined(misfit: _Misfit, report: PoseReport) -> _Refined:
         status="refined",
         warnings=_refined_misfit(before, after, worst) + doubts,
         scale_spread=spread,
+        behind_infinity=behind_infinity(tracks, Ts),
         E=_as_E(Ts),
         residual_px=tuple(median_residuals(replace(tracks, right_px=straight), Ts).tolist()),
         straightened_px=tuple(0.0 if bend is None else bend.rms_px for bend in bends),

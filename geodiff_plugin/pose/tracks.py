@@ -50,6 +50,10 @@ _BLOCKS = 10
 _FEWEST_IN_BLOCK = 5
 #: Fewest blocks.
 _FEWEST_BLOCKS = 3
+#: Nearer to its epipolar line than this a match says on which side of infinity it lies, pixels.
+_ON_LINE_PX = 2.0
+#: A match lies behind infinity if it is further than this from the point at infinity, pixels.
+_BEHIND_PX = 1.0
 _TINY = 1e-12
 #: A grey image ``(H, W)`` uint8 and its K ``(3, 3)`` float64.
 GreyImage = tuple[np.ndarray, np.ndarray]
@@ -181,6 +185,25 @@ def blocks(tracks: Tracks) -> np.ndarray:
     width = max(2.0 * tracks.K_left[0, 2], 1.0)  # that of an image whose principal point is near its middle
     column, row = (tracks.left_px // (width / _BLOCKS)).astype(int).T
     return np.unique(row * 1000 + column, return_inverse=True)[1]
+
+
+def behind_infinity(tracks: Tracks, Ts: np.ndarray) -> float:
+    """Share of the matches on their epipolar lines that lie beyond the point at infinity; NaN for too few.
+
+    Two rays that diverge meet behind the cameras. Of right cameras and poses only noise and wrong matches do
+    so, by less than ``_BEHIND_PX``: in 33 right pairs up to 1.5 % of the matches did by more.
+    """
+    counts, behind = 0, 0
+    for v, T in enumerate(Ts):
+        seen = tracks.view(v)
+        seen = seen.kept(residuals_px(seen, T[None])[0] < _ON_LINE_PX)
+        inverse_depth = solve_inverse_depth(seen, T[None])
+        far, at = (
+            project_tracks(seen.rays, w, seen.K_rights[0], T).px for w in (np.zeros(len(seen)), inverse_depth)
+        )
+        beyond = (inverse_depth < 0) & (np.linalg.norm(at - far, axis=1) > _BEHIND_PX)
+        counts, behind = counts + len(seen), behind + int(beyond.sum())
+    return behind / counts if counts >= FEWEST else float("nan")
 
 
 def across_lines(tracks: Tracks, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -99,7 +99,7 @@ def finish(
     K = resize_intrinsics(native.K_left[None], native.size, image_size(depth_m))
     refined = refine(evidence, members, depth_m, left_01, options.config) if options.config.crisp else None
     if refined is not None:
-        depth_m = refined.depth_m
+        depth_m = _within_reach(refined.depth_m, evidence, options.config)
     if uncertainty is not None:
         uncertainty = uncertainty.to(depth_m)
         if refined is not None:
@@ -151,6 +151,18 @@ def _within_range(depth_m: Tensor, members: Sequence[Member]) -> Tensor:
     """A map clamped, in place, to the range of the members that it was made of: resizing may overshoot."""
     near_m, far_m = (torch.cat([getattr(m, name) for m in members]) for name in ("near_m", "far_m"))
     return depth_m.clamp_(near_m.to(depth_m).amin(0, keepdim=True), far_m.to(depth_m).amax(0, keepdim=True))
+
+
+def _within_reach(depth_m: Tensor, evidence: Evidence, config: GuidanceConfig) -> Tensor:
+    """A map clamped to what its cameras can measure, or to the range that the user gave, if that is further.
+
+    Matches at infinity pull a fit without bound, in log depth, wherever nothing else holds it.
+    """
+    if evidence.volume is None:
+        return depth_m
+    _, reach_m = evidence.volume.reach_m
+    given_m = 0.0 if config.depth_range is None else config.depth_range[1]
+    return depth_m.clamp(max=max(reach_m, given_m))
 
 
 def _mean(members: Sequence[Member], name: str) -> Tensor | None:

@@ -68,6 +68,12 @@ OTHER_UNIT = math.log(20.0)
 EPIPOLAR_PX = 2.0
 #: The distance that is not trusted, twice the one that is reported.
 EPIPOLAR_WRONG = 4.0
+#: A larger share of matches behind infinity is not trusted: it was up to .015 for right pairs, and .12 to .88
+#: where the principal point or the rotation was off and things were far away.
+MOST_BEHIND = 0.05
+#: A larger radial coefficient k1 left in both pictures is not trusted: it was up to .08 for right pairs, and
+#: .16 or more where a distortion of .25 had not been removed.
+MOST_DISTORTION = 0.15
 #: A refined pose whose scale is less certain than this is not trusted, unless known depths give the scale.
 MOST_SCALE_SPREAD = 0.1
 #: Known depths that fix a scale and a shift, and show when one of them is wrong.
@@ -185,6 +191,12 @@ def _unit_doubted(found: Indicators) -> bool:
     return far and SUSPECT_BASELINE_M <= found.baseline_m <= LONG_BASELINE_M and not _unit_stated(found)
 
 
+def _behind_infinity(found: Indicators) -> bool:
+    """Whether rays diverge, and no mistake that is named already explains it."""
+    named = found.inverse_fits or bool(found.mistakes) or _exchanged(found)
+    return found.behind_infinity > MOST_BEHIND and not named
+
+
 def _scale_uncertain(found: Indicators) -> bool:
     return found.scale_spread > MOST_SCALE_SPREAD and found.points < LEAST_POINTS
 
@@ -245,6 +257,23 @@ def _why_off_lines(found: Indicators) -> str:
     return (
         f"Matches lie {found.epipolar_px:.1f} px off their epipolar lines, and no pose near the given one "
         "brings them closer: are the images rectified, the poses right, and K for these images?"
+    )
+
+
+def _why_behind(found: Indicators) -> str:
+    return (
+        f"{100 * found.behind_infinity:.0f} % of the matches lie behind infinity, where the rays of the two "
+        "cameras diverge. Likely causes: another cx of the right camera than K says (give K_right, or "
+        "--cx-right), a wrong rotation in E, a right image that was cropped or stretched, or things that "
+        "moved."
+    )
+
+
+def _why_distorted(found: Indicators) -> str:
+    return (
+        "The distance of matches from their epipolar lines grows away from the centre of the pictures, as by "
+        f"a lens distortion of k1 = {found.distortion:+.2f} that was not removed: rectify the pictures, or "
+        "give the distortion with the calibration."
     )
 
 
@@ -346,6 +375,8 @@ REASONS = (
             "image of something else?"
         ),
     ),
+    Rule("views.behind-infinity", _behind_infinity, _why_behind),
+    Rule("views.distorted", lambda found: abs(found.distortion) > MOST_DISTORTION, _why_distorted),
     Rule("pose.off-lines", lambda found: found.epipolar_px > EPIPOLAR_WRONG, _why_off_lines),
     Rule("views.disagree", _views_disagree, _why_disagreement),
 )

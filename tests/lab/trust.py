@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
+import cv2
 import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -33,6 +34,8 @@ TRUST_NOTE = (
     "Median error of the depth as a share of the truth; left and right exchanged, there is no truth. A wrong "
     "focal length of a rectified pair scales the depth and changes nothing else: two views cannot show it."
 )
+#: Coefficient k1 of the distortion that is not removed.
+BARREL = -0.25
 #: Known points of the kinds about points: so many of the truth.
 POINTS = 200
 Change = Callable[[StereoSample, StereoSample], StereoSample]
@@ -61,6 +64,67 @@ def _shifted(sample: StereoSample, _: StereoSample) -> StereoSample:
     """The right picture is the left one, moved: every disparity is the same."""
     shift = max(2, sample.left.shape[1] // 20)
     return replace(sample, right=np.roll(sample.left, -shift, axis=1), K_right=sample.K_left)
+
+
+def _px(sample: StereoSample, px: float) -> float:
+    """Pixels of a picture 640 wide, in those of the sample."""
+    return px * sample.left.shape[1] / 640
+
+
+def _barrel(image: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """An image or a map as a lens with k1 = ``BARREL`` would have taken it, under the same K."""
+    v, u = np.indices(image.shape[:2], dtype=np.float64)
+    bent = np.stack([u.ravel(), v.ravel()], -1)[:, None]
+    straight = cv2.undistortPoints(bent, K, np.array([BARREL, 0, 0, 0]), P=K).reshape(*image.shape[:2], 2)
+    way = cv2.INTER_LINEAR if image.ndim == 3 else cv2.INTER_NEAREST
+    return cv2.remap(image, straight.astype(np.float32), None, way)
+
+
+def _distorted(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """Distortion that was not removed, in both views; the truth is bent as the left one."""
+    depth_m = _barrel(np.where(sample.valid, sample.depth_m, 0), sample.K_left)
+    return replace(
+        sample,
+        left=_barrel(sample.left, sample.K_left),
+        right=_barrel(sample.right, sample.K_right),
+        depth_m=depth_m,
+        valid=depth_m > 0,
+    )
+
+
+def _moved_part(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """The middle third of the rows of the right picture has moved along them."""
+    right, third = sample.right.copy(), len(sample.right) // 3
+    right[third : 2 * third] = np.roll(right[third : 2 * third], round(_px(sample, 30)), axis=1)
+    return replace(sample, right=right)
+
+
+def _rolled(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """A rolling shutter: rows of the right picture shift the more the lower they lie."""
+    v, u = np.indices(sample.right.shape[:2], dtype=np.float32)
+    shift = np.float32(_px(sample, 15)) * v / len(v)
+    return replace(sample, right=cv2.remap(sample.right, u + shift, v, cv2.INTER_LINEAR))
+
+
+def _off_centre(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """The right principal point is off, so that what is far lies behind infinity."""
+    K_right = sample.K_right.copy()
+    K_right[0, 2] -= _px(sample, 10)
+    return replace(sample, K_right=K_right)
+
+
+def _stretched(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """The right picture without a tenth of its columns, stretched to its size."""
+    height, width = sample.right.shape[:2]
+    part = sample.right[:, : width - width // 10]
+    return replace(sample, right=cv2.resize(part, (width, height)))
+
+
+def _yawed(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """The right camera is turned by a degree: between parallel cameras nearly a shift of cx."""
+    yaw = np.eye(4)
+    yaw[:3, :3] = Rotation.from_euler("y", 1.0, degrees=True).as_matrix()
+    return replace(sample, E=sample.E @ yaw)
 
 
 def _as_it_is(sample: StereoSample, _: StereoSample) -> StereoSample:
@@ -98,6 +162,12 @@ KINDS: dict[str, Kind] = {
     ),
     "one-picture": Kind("the left image twice", lambda s, _: replace(s, right=s.left, K_right=s.K_left)),
     "shifted": Kind("right image a shifted copy of the left one", _shifted),
+    "distorted": Kind("distortion of k1 = -0.25 in both views", _distorted),
+    "moved-part": Kind("a third of the right picture moved by 30 px", _moved_part),
+    "rolling": Kind("rolling shutter of 15 px", _rolled),
+    "centre": Kind("right cx off by 10 px, far things behind infinity", _off_centre),
+    "stretched": Kind("right picture cropped by a tenth and stretched", _stretched),
+    "yaw": Kind("E turned by 1 degree of yaw", _yawed),
     "points-256": Kind("points in 1/256 m read as millimetres", points=0.256),
     "points-mm": Kind("points in millimetres read as metres", points=1000.0),
     "points-3": Kind("points 3 times too far", points=3.0),

@@ -12,10 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.pose.lens import remaining_distortion
 from geodiff_plugin.pose.mistakes import find_mistake
 from geodiff_plugin.pose.refine import fit_displacement, refine_views, straightened, undecided
 from geodiff_plugin.pose.solve import PosePrior, is_rig, settle_poses, solve_poses
-from geodiff_plugin.pose.tracks import Tracks, median_residuals, residuals_px, solve_inverse_depth
+from geodiff_plugin.pose.tracks import (
+    Tracks,
+    behind_infinity,
+    median_residuals,
+    residuals_px,
+    solve_inverse_depth,
+)
 from geodiff_plugin.result.indicators import indicators_of
 from geodiff_plugin.types import CameraView, PosedViews
 from tests.scenes import render_pair
@@ -183,6 +190,39 @@ def test_right_and_inexact_poses_are_no_mistakes(near: np.ndarray, degrees: floa
     for turn in np.random.default_rng(0).normal(size=(10, 3)):
         given = np.linalg.inv(near @ pose(degrees * turn / np.linalg.norm(turn), (0, 0, 0)))
         assert find_mistake(tracks, given, Ts[0]) is None
+
+
+RIG = pose((0, 0, 0), (0.3, 0, 0))
+
+
+def test_what_lies_behind_infinity_is_counted_on_its_own_side_alone() -> None:
+    """Depths are uniform in 2 to 8 m: disparities of 18.75 px and more."""
+    tracks, Ts, depth_m = make_tracks([RIG], outliers=0.0)
+    assert behind_infinity(tracks, Ts) == 0.0
+    for moved, share in ((-30.0, float((150.0 / depth_m < 29.0).mean())), (30.0, 0.0), (-17.0, 0.0)):
+        K_off = K.copy()
+        K_off[0, 2] += moved  # a cx too small by d takes d from every disparity
+        off = replace(tracks, K_rights=K_off[None])
+        assert behind_infinity(off, Ts) == pytest.approx(share, abs=0.01)
+    up = tracks.right_px + [0.0, 3.0]  # off its lines a match says nothing
+    assert np.isnan(behind_infinity(replace(tracks, right_px=up), Ts))
+    assert np.isnan(behind_infinity(tracks.kept(slice(39)), Ts))
+    assert behind_infinity(tracks.kept(slice(40)), Ts) == 0.0
+
+
+@pytest.mark.parametrize("k1", [-0.25, -0.1, 0.0, 0.2])
+@pytest.mark.parametrize("E", [RIG, TRUE], ids=["rig", "posed"])
+def test_distortion_of_both_pictures_is_measured(k1: float, E: np.ndarray) -> None:
+    tracks, Ts, _ = make_tracks([E], count=1500, outliers=0.05)
+
+    def distorted(px: np.ndarray) -> np.ndarray:  # OpenCV's model, written out
+        x = (px - K[:2, 2]) / 500.0
+        return 500.0 * x * (1.0 + k1 * (x**2).sum(-1, keepdims=True)) + K[:2, 2]
+
+    bent = replace(tracks, left_px=distorted(tracks.left_px), right_px=distorted(tracks.right_px))
+    found = remaining_distortion(bent, Ts[0])
+    assert found == pytest.approx(k1, abs=0.03) and abs(found) <= abs(k1) + 0.005
+    assert np.isnan(remaining_distortion(bent.kept(slice(39)), Ts[0]))
 
 
 def bent(tracks: Tracks, px: float) -> Tracks:

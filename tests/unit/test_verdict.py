@@ -140,6 +140,32 @@ def test_a_doubted_unit_is_not_trusted_unless_the_range_is_stated(signs, code):
     assert [each for each in found if each != "depth.range"] == ([] if code is None else [code])
 
 
+@pytest.mark.parametrize(
+    ("signs", "code"),
+    [
+        ({"behind_infinity": 0.049}, None),
+        ({"behind_infinity": 0.051}, "views.behind-infinity"),
+        ({"behind_infinity": math.nan}, None),
+        ({"distortion": 0.149}, None),
+        ({"distortion": 0.151}, "views.distorted"),
+        ({"distortion": -0.149}, None),
+        ({"distortion": -0.151}, "views.distorted"),
+        ({"distortion": math.nan}, None),
+    ],
+)
+def test_what_the_matches_show_of_cameras_and_lenses(signs, code):
+    found = [reason.code for reason in judge(replace(GOOD, **signs)).reasons]
+    assert found == ([] if code is None else [code])
+
+
+def test_a_named_mistake_explains_diverging_rays():
+    for signs in ({"inverse_fits": True}, {"mistakes": (Message("pose.opengl", "OpenGL."),)}):
+        codes = [reason.code for reason in judge(replace(GOOD, behind_infinity=0.9, **signs)).reasons]
+        assert codes and "views.behind-infinity" not in codes
+    exchanged = replace(GOOD, behind_infinity=0.9, rank_correlation=-0.5)
+    assert [reason.code for reason in judge(exchanged).reasons] == ["depth.exchanged"]
+
+
 def test_a_stated_range_removes_the_doubt_about_a_long_baseline_and_no_other():
     long = Message("baseline.long", "E has a baseline of 25 m.")
     other = Message("camera.principal-point", "K is for another image.")
@@ -198,6 +224,25 @@ def test_a_rendered_pair_right_and_wrong(run, scene):
         run(right=left.copy())
     with pytest.raises(InputError, match="Do not trust this depth"):
         run(right=np.ascontiguousarray(right[:, ::-1]), strict=True)
+
+
+def test_depth_is_at_most_what_the_cameras_can_measure(run, scene):
+    _, _, K, E, depth = scene
+    out = run()
+    reach_m = K[0, 0] * E[0, 3] / 0.3
+    assert out.prediction.max() <= reach_m * 1.01
+    # Far things under a tenth of the baseline: the sky of this scene.
+    shorter = np.ones((4, 4))
+    shorter[:3, 3] = 0.1
+    assert run(E=E * shorter).prediction.max() <= 0.1 * reach_m * 1.01
+
+
+def test_a_principal_point_that_is_off_is_found_where_things_are_far(run, scene):
+    _, _, K, _, depth = scene
+    K_right = K.copy()
+    K_right[0, 2] -= K[0, 0] * scene[3][0, 3] * float(np.median(1 / depth))  # the median lies at infinity
+    codes = [reason.code for reason in run(K=(K, K_right)).verdicts[0].reasons]
+    assert "views.behind-infinity" in codes
 
 
 def test_centimetres_for_metres_are_never_trusted(run, scene):
