@@ -33,11 +33,13 @@ class Mutant(NamedTuple):
 
 
 def of(file: str, *slips: tuple[str, str], tests: tuple[str, ...] = ()) -> list[Mutant]:
-    """Mutants of one file; ``tests`` run behind the parts and the references."""
+    """Mutants of one file; ``tests`` run before the parts and the references."""
     return [Mutant(file, *slip, tests) for slip in slips]
 
 
 UNIT = "tests/unit/test_"
+THRESHOLDS = (f"{UNIT}verdict_thresholds.py", f"{UNIT}verdict.py")
+CAPTURES = ("tests/parity/test_capture_references.py",)
 MUTANTS = [
     *of(
         "geometry.py",
@@ -299,6 +301,93 @@ MUTANTS = [
         ("max(width, height) / max(taken)", "1.0"),
         tests=(f"{UNIT}pose_estimate.py",),
     ),
+    *of(
+        "result/verdict.py",
+        ("OFF_MATCHES = math.log(1.2)", "OFF_MATCHES = math.log(1.3)"),
+        ("LEAST_CONFIDENCE = 0.5\n", "LEAST_CONFIDENCE = 0.45\n"),
+        ("LEAST_MATCHED = 0.12", "LEAST_MATCHED = 0.1"),
+        ("MOST_EXCHANGED = -0.2", "MOST_EXCHANGED = -0.3"),
+        ("LEAST_CORRELATION = 0.2\n", "LEAST_CORRELATION = 0.15\n"),
+        ("MATCHED_ENOUGH = 0.5\n", "MATCHED_ENOUGH = 0.6\n"),
+        ("WEAK_EPIPOLAR_PX = 1.0", "WEAK_EPIPOLAR_PX = 1.3"),
+        ("LEAST_SPREAD = 0.15", "LEAST_SPREAD = 0.2"),
+        ("POINTS_REPORTED = math.log(1.08)", "POINTS_REPORTED = math.log(1.1)"),
+        ("MANY_OFF = 0.25", "MANY_OFF = 0.3"),
+        ("MOST_OFF = 0.5", "MOST_OFF = 0.6"),
+        ("OWN_METRES = math.log(1.9)", "OWN_METRES = math.log(2.1)"),
+        ("EPIPOLAR_WRONG = 4.0", "EPIPOLAR_WRONG = 5.0"),
+        ("MOST_SCALE_SPREAD = 0.1", "MOST_SCALE_SPREAD = 0.12"),
+        ("ENOUGH_POINTS = 50", "ENOUGH_POINTS = 40"),
+        ("LEAST_COVER = 0.25", "LEAST_COVER = 0.2"),
+        ("MOST_BEHIND = 0.05", "MOST_BEHIND = 0.1"),
+        ("FAR_SCENE_OF_RIG_M = 50.0", "FAR_SCENE_OF_RIG_M = 100.0"),
+        ("OTHER_UNIT = math.log(20.0)", "OTHER_UNIT = math.log(60.0)"),
+        ("1.0 - 0.75 * (off", "1.0 - 0.5 * (off"),
+        tests=THRESHOLDS,
+    ),
+    *of(
+        "result/indicators.py",
+        ("mean / points.inverse_depth", "points.inverse_depth / mean"),
+        ("CONFIDENT = 0.5", "CONFIDENT = 0.6"),
+        ("POINTS_WRONG = math.log(1.2)", "POINTS_WRONG = math.log(1.3)"),
+        ("resized * matches.inverse_depth", "resized / matches.inverse_depth"),
+        ("1.0 / sample.nanmedian()", "sample.nanmedian()"),
+        tests=CAPTURES,
+    ),
+    *of(
+        "result/confidence.py",
+        ("(depth_m[rows] - E[2, 3]) ** 2", "(depth_m[rows] + E[2, 3]) ** 2"),
+        ("E[0, 3] - ray_x * E[2, 3]", "E[0, 3] + ray_x * E[2, 3]"),
+        ("scale_spread * depth_m[rows])", "scale_spread)"),
+        tests=CAPTURES,
+    ),
+    *of("result/voting.py", ("+ 0.5) * (columns / width) - 0.5", ") * (columns / width)"), tests=CAPTURES),
+    *of(
+        "result/output.py",
+        ("else output.uncertainty * factor", "else output.uncertainty"),
+        tests=CAPTURES,
+    ),
+    *of(
+        "pose/multiview.py",
+        ("turned = scale * centres @ Q.T", "turned = scale * centres @ Q"),
+        ("points=scale * result.points @ Q.T + shift", "points=scale * result.points @ Q + shift"),
+        ("E[:, :3, :3], E[:, :3, 3] = Q @ E", "E[:, :3, :3], E[:, :3, 3] = Q.T @ E"),
+        ("np.array([a.spread, b.spread]) ** -2.0", "np.array([a.spread, b.spread]) ** -1.0"),
+        ("math.log(a[k] / b[k])", "math.log(b[k] / a[k])"),
+        tests=CAPTURES,
+    ),
+    *of(
+        "pose/tracks.py",
+        ("K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5", "K[:2, 2] = K[:2, 2] * scale"),
+        ("views[0][1][0, 0] / K_right[0, 0]", "K_right[0, 0] / views[0][1][0, 0]"),
+        ("(inverse_depth < 0) & (np", "(inverse_depth > 0) & (np"),
+        tests=(*CAPTURES, f"{UNIT}pose_refine.py"),
+    ),
+    *of(
+        "pose/lens.py",
+        ("np.c_[(ahead - behind)", "np.c_[(behind - ahead)"),
+        ("abs(k1) - UNCERTAIN * error", "abs(k1) + UNCERTAIN * error"),
+        tests=(f"{UNIT}pose_refine.py",),
+    ),
+    *of(
+        "pose/conventions.py",
+        ("[[cosine, -sine], [sine, cosine]]", "[[cosine, sine], [-sine, cosine]]"),
+        ("MOST_GUESS = 0.007", "MOST_GUESS = 0.01"),
+        tests=(f"{UNIT}pose_conventions.py",),
+    ),
+    *of(
+        "capture/frames.py",
+        ("frame.points * factor", "frame.points"),
+        ("points=solved.points * factor", "points=solved.points"),
+        ("solved.E_given * longer", "solved.E_given"),
+        tests=CAPTURES,
+    ),
+    *of(
+        "formats/depth.py",
+        ("inverse - (K_right[0, 2] - K_left[0, 2])", "inverse + (K_right[0, 2] - K_left[0, 2])"),
+        tests=CAPTURES,
+    ),
+    *of("formats/transforms.py", ("pose[:3, 3] /= check", "pose[:3, 3] *= check"), tests=CAPTURES),
 ]
 
 
@@ -320,7 +409,7 @@ def killed(copy: Path, mutant: Mutant | None) -> bool:
     if not child:
         status = 3
         try:
-            status = _run(copy, [PARTS, REFERENCES, *(() if mutant is None else mutant.tests)])
+            status = _run(copy, [*(() if mutant is None else mutant.tests), PARTS, REFERENCES])
         except BaseException:
             traceback.print_exc()
         finally:

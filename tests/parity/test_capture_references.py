@@ -1,0 +1,214 @@
+"""Captures, poses, formats and act 3 against NumPy, or against made-up captures whose metres are known."""
+
+import json
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin import Capture
+from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.formats.depth import disparity_of_depth
+from geodiff_plugin.formats.transforms import nerf_pose
+from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
+from geodiff_plugin.matching import Matches
+from geodiff_plugin.pose.multiview import SolvedCapture, _scaled
+from geodiff_plugin.pose.tracks import grey_image, grey_views
+from geodiff_plugin.result.confidence import expected_error
+from geodiff_plugin.result.indicators import measure_indicators
+from geodiff_plugin.result.output import _in_the_priors_metres
+from geodiff_plugin.result.voting import _enlarged
+from geodiff_plugin.types import CameraView, MetricDepthOutput, PosedViews
+
+K = np.array([[400.0, 0.0, 159.5], [0.0, 410.0, 119.5], [0.0, 0.0, 1.0]])
+
+
+def poses(count: int) -> np.ndarray:
+    """``(count, 4, 4)`` camera-to-world on a winding walk."""
+    E = np.tile(np.eye(4), (count, 1, 1))
+    for i, pose in enumerate(E):
+        pose[:3, 3] = 0.3 * i, 0.2 * math.sin(i), 0.1 * math.cos(2 * i)
+        turn = [5.0 * math.sin(i), 3.0 * i, 4.0 * math.cos(i)]
+        pose[:3, :3] = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+    return E
+
+
+def test_a_solve_comes_back_to_the_given_frame_from_any_other():
+    """The solve of a made-up capture is the truth in another world: 1.7 times as small, turned and moved."""
+    true, points = poses(9), np.random.default_rng(0).uniform((-2, -2, 3), (2, 2, 8), (40, 3))
+    R, t = Rotation.from_euler("xyz", [20.0, -35.0, 50.0], degrees=True).as_matrix(), np.array([3.0, -1, 2])
+    moved = true.copy()
+    moved[:, :3, :3], moved[:, :3, 3] = R @ true[:, :3, :3], (true[:, :3, 3] @ R.T) / 1.7 + t
+    seen = tuple((np.zeros((40, 2)), np.arange(40)) for _ in true)
+    solved = SolvedCapture(
+        "solved", moved, true, np.tile(K, (9, 1, 1)), np.ones(9, bool), points @ R.T / 1.7 + t, seen
+    )
+    depths = [dict(enumerate(((points - E[:3, 3]) @ E[:3, 2]).tolist())) for E in true]
+    found = _scaled(solved, depths, [{k: z / 1.7 for k, z in of.items()} for of in depths])
+    np.testing.assert_allclose(found.E, true, atol=1e-9)
+    np.testing.assert_allclose(found.points, points, atol=1e-9)
+    assert found.scale_depth == pytest.approx(1.7) and found.scale_trajectory == pytest.approx(1.7)
+    assert found.scale_spread == pytest.approx((0.015**-2 + 0.02**-2) ** -0.5, rel=1e-3)
+    # The depth of the scene says 1.3 times as much: the mean by the inverse variances.
+    torn = _scaled(solved, depths, [{k: z / 1.7 / 1.3 for k, z in of.items()} for of in depths])
+    shares = np.array([0.015, 0.02]) ** -2.0
+    shares /= shares.sum()
+    longer = math.exp(shares[0] * math.log(1.3))
+    apart = np.linalg.norm(np.diff(torn.E[:, :3, 3], axis=0), axis=1)
+    np.testing.assert_allclose(apart, longer * np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1))
+    assert torn.scale_spread == pytest.approx(
+        math.hypot(math.sqrt(shares[0] * shares[1]) * math.log(1.3), found.scale_spread), rel=1e-3
+    )
+
+
+def test_everything_of_a_capture_is_rescaled_together(tmp_path):
+    """A capture in feet whose metres are known: poses, given poses, points of the solve and of the model."""
+    E = poses(3)
+    for i in range(3):
+        Image.new("RGB", (320, 240)).save(tmp_path / f"{i}.png")
+    frames = [
+        {"file_path": f"{i}.png", "transform_matrix": (E[i] @ OPENGL_FROM_OPENCV).tolist()} for i in range(3)
+    ]
+    camera = {"fl_x": 400.0, "fl_y": 410.0, "cx": 160.0, "cy": 120.0, "w": 320, "h": 240}
+    (tmp_path / "transforms.json").write_text(json.dumps(camera | {"frames": frames}))
+    capture = Capture.open(tmp_path)
+    known = np.array([[1.0, 2.0, 3.0]])
+    capture.frames = [replace(frame, points=known) for frame in capture.frames]
+    seen = tuple((np.zeros((1, 2)), np.zeros(1, int)) for _ in E)
+    capture.solved = SolvedCapture("solved", E, E, np.tile(K, (3, 1, 1)), np.ones(3, bool), known, seen)
+    before = capture.solved.pose(0, 2)
+    capture.rescale(0.3048)
+    after = capture.solved.pose(0, 2)
+    np.testing.assert_allclose(after[:3, 3], 0.3048 * before[:3, 3])
+    np.testing.assert_allclose(after[:3, :3], before[:3, :3])
+    np.testing.assert_allclose(capture.solved.points, 0.3048 * known)
+    np.testing.assert_allclose(capture.solved.E_given[:, :3, 3], 0.3048 * E[:, :3, 3])
+    np.testing.assert_allclose(capture.poses[:, :3, 3], 0.3048 * E[:, :3, 3])
+    np.testing.assert_allclose(capture.frames[1].points, 0.3048 * known)
+    assert capture.unit == "m"
+
+
+def test_a_shrunk_picture_keeps_every_ray_and_right_views_are_as_fine_as_the_left():
+    image = torch.rand(3, 240, 320)
+    _, shrunk = grey_image(image, torch.from_numpy(K), 0.25)
+    # The middle of the first pixel's block of 4 x 4 is at (1.5, 1.5).
+    np.testing.assert_allclose(np.linalg.solve(shrunk, [0, 0, 1]), np.linalg.solve(K, [1.5, 1.5, 1]))
+    finer = K.copy()
+    finer[:2] *= 2.0
+    right = CameraView(torch.rand(3, 480, 640), torch.from_numpy(finer), torch.eye(4))
+    views = grey_views(image, [right], torch.from_numpy(K))
+    assert [grey.shape for grey, _ in views] == [(240, 320), (240, 320)]
+    assert views[1][1][0, 0] == pytest.approx(views[0][1][0, 0])
+
+
+def test_disparity_of_depth_is_what_both_cameras_see():
+    """Of a point projected into both cameras, whose principal points differ (doffs)."""
+    K_right, E = K.copy(), np.eye(4)
+    K_right[0, 2], E[0, 3] = K[0, 2] + 7.0, 0.2
+    depth = np.array([[2.0, 5.0], [np.inf, 0.0]])
+    X = np.array([0.3, -0.1, 5.0])
+    left, right = K @ X, K_right @ (X - E[:3, 3])
+    found = disparity_of_depth(depth, K, K_right, E)
+    assert found[0, 1] == pytest.approx(left[0] / left[2] - right[0] / right[2], rel=1e-6)
+    assert np.isinf(found[1]).all()
+
+
+def test_applied_scale_of_a_file_is_taken_out():
+    """Nerfstudio multiplied the positions by it when it wrote the file."""
+    E = poses(3)[2]
+    written = E @ OPENGL_FROM_OPENCV
+    written[:3, 3] *= 0.25
+    found = nerf_pose({"transform_matrix": written.tolist(), "applied_scale": 0.25})
+    np.testing.assert_allclose(found, E, atol=1e-12)
+
+
+def test_everything_with_a_length_comes_out_in_the_priors_metres():
+    over_prior = torch.tensor([[4.0, 4.0, 4.0]])
+    output = MetricDepthOutput(
+        prediction=np.array([8.0, 12.0]),
+        uncertainty=np.array([0.4, 0.8]),
+        global_scale=torch.tensor([[2.0]]),
+        prior_scale=torch.tensor([[4.0]]),
+    )
+    found = _in_the_priors_metres(output, over_prior)
+    np.testing.assert_allclose(found.prediction, [2.0, 3.0])
+    np.testing.assert_allclose(found.uncertainty, [0.1, 0.2])
+    assert float(found.global_scale) == 0.5 and float(found.prior_scale) == 1.0 and found.rescaled == 0.25
+
+
+@pytest.mark.parametrize("centre", [(0.2, 0.0, 0.0), (0.1, 0.05, 0.5), (0.1, -0.05, -0.5), (0.0, 0.1, 0.2)])
+def test_expected_error_is_a_quarter_pixel_over_the_change_of_the_right_pixel_with_depth(centre):
+    E = np.eye(4)
+    E[:3, 3] = centre
+    depth, step = np.random.default_rng(0).uniform(2.0, 6.0, (6, 8)), 1e-6
+    small = np.array([[10.0, 0, 3.5], [0, 10.0, 2.5], [0, 0, 1]])
+    v, u = np.indices(depth.shape)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(small).T
+
+    def right_px(z: np.ndarray) -> np.ndarray:
+        p = (rays * z[..., None] - E[:3, 3]) @ small.T
+        return p[..., :2] / p[..., 2:]
+
+    moves = np.linalg.norm(right_px(depth + step) - right_px(depth - step), axis=-1) / (2 * step)
+    np.testing.assert_allclose(expected_error(depth, small, [E]), 0.25 / moves, rtol=1e-5)
+    both = expected_error(depth, small, [E], scale_spread=0.1)
+    np.testing.assert_allclose(both, np.hypot(0.25 / moves, 0.1 * depth), rtol=1e-5)
+
+
+def _matches(inverse_depth: np.ndarray, confidence: np.ndarray, step: float) -> Matches:
+    def tensor(x: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(x.astype(np.float32))[None]
+
+    return SimpleNamespace(
+        inverse_depth=tensor(inverse_depth),
+        confidence=tensor(confidence),
+        plane_step=torch.tensor(step),
+        size=inverse_depth.shape,
+    )
+
+
+def test_indicators_of_matches_and_points_against_numpy():
+    rng, step = np.random.default_rng(0), 0.001
+    inverse = rng.uniform(0.1, 1.0, (24, 32))
+    confidence = rng.uniform(0.0, 1.0, inverse.shape)
+    depth = np.exp(rng.normal(0.05, 0.1, inverse.shape)) / inverse
+    known = np.zeros(inverse.shape)
+    known[2::5, 2::5] = 1.0
+    smooth = np.full(inverse.shape, 0.5)
+    matches = _matches(inverse, confidence, step)
+    native = PosedViews(torch.zeros(3, 24, 32), (), torch.eye(3))
+    evidence = Evidence(native, native, None, matches)
+    numbers = measure_indicators(evidence, torch.from_numpy(depth)[None, None].float(), False)
+    sure = confidence > 0.5
+    assert float(numbers["matched"]) == pytest.approx(sure.mean())
+    assert float(numbers["off_matches"]) == pytest.approx(
+        np.sort(np.abs(np.log(depth * inverse)[sure]))[(sure.sum() - 1) // 2], rel=1e-4
+    )
+    low, high = np.quantile(inverse[sure], (0.05, 0.95))
+    assert float(numbers["spread"]) == pytest.approx(np.log(high / low), rel=1e-4)
+    assert float(numbers["scene_m"]) == pytest.approx(1.0 / np.median(inverse[sure]), rel=2e-2)
+    # Points 1.15 times as far as the matches, a third of them 1.25 times.
+    far = np.where(np.arange(inverse.size).reshape(inverse.shape) % 3, 1.15, 1.25)
+    points = _matches(smooth / far, known, step)
+    compared = Evidence(native, native, None, _matches(smooth, np.ones_like(smooth), step), points)
+    numbers = measure_indicators(compared, torch.full((1, 1, 24, 32), 2.0), False)
+    assert float(numbers["points_ratio"]) == pytest.approx(1.15, rel=1e-4)
+    assert float(numbers["points_off"]) == pytest.approx((far[known > 0] > 1.2).mean())
+    assert float(numbers["points"]) == known.sum() and float(numbers["points_compared"]) == known.sum()
+
+
+def test_enlarged_votes_lie_where_the_pixels_do():
+    """Votes that rise along x and y, in one colour, rise the same when enlarged, without a shift."""
+    rows, columns, factor = 8, 10, 4
+    v, u = np.indices((rows, columns), dtype=np.float32)
+    voted = torch.from_numpy(0.01 * u + 0.02 * v)
+    found = _enlarged(voted, torch.zeros(3, rows, columns), torch.zeros(3, rows * factor, columns * factor))
+    y, x = (np.indices((rows * factor, columns * factor)) + 0.5) / factor - 0.5
+    inner = slice(6, -6)
+    off = found.numpy()[inner, inner] - (0.01 * x + 0.02 * y)[inner, inner]
+    assert abs(off.mean()) < 1e-4 and np.abs(off).max() < 4e-3
