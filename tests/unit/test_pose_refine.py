@@ -210,6 +210,20 @@ def test_what_lies_behind_infinity_is_counted_on_its_own_side_alone() -> None:
     assert behind_infinity(tracks.kept(slice(40)), Ts) == 0.0
 
 
+def test_a_principal_point_that_is_off_is_seen_in_pictures_of_far_things() -> None:
+    rig = render_pair(0, size=(240, 320), posed=False)
+    left, K_left, E = rig.left.image_01.float(), rig.K_left.float(), rig.E.numpy()
+    disparity_px = float(K_left[0, 0]) * E[0, 3] / float(rig.left.depth_m.median())
+    shares = []
+    for off_px in (0.0, disparity_px):  # what is further than the median then lies behind infinity
+        K_right = rig.K_right.float().clone()
+        K_right[0, 2] -= off_px
+        T = torch.from_numpy(np.linalg.inv(E)).float()
+        rights = [CameraView(rig.right.image_01.float(), K_right, T)]
+        shares.append(refine_views(left, rights, K_left)[1].behind_infinity)
+    assert shares[0] < 0.02 and shares[1] > 0.2
+
+
 @pytest.mark.parametrize("k1", [-0.25, -0.1, 0.0, 0.2])
 @pytest.mark.parametrize("E", [RIG, TRUE], ids=["rig", "posed"])
 def test_distortion_of_both_pictures_is_measured(k1: float, E: np.ndarray) -> None:
