@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -12,13 +13,17 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from geodiff_plugin.cli.commands import new_group
-from geodiff_plugin.cli.terminal import new_table, print_lines, show
+from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED, new_table, print_lines, show
 from geodiff_plugin.evaluation.options import COMMANDS
 from geodiff_plugin.formats.out import check_out
+from geodiff_plugin.jobs.telling import say
 from geodiff_plugin.options import Command, declare
 
 if TYPE_CHECKING:
     from geodiff_plugin.evaluation.experiment import Page
+
+#: Broken samples that are named.
+MOST_NAMES = 9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,13 +32,21 @@ class _ListOptions:
 
 
 def run_and_show(measure: Callable[[Any], Any], options: Any) -> None:
-    """Measure, and print the page or the path of the figure unless the options say quiet."""
+    """Measure, and print the page or the path of the figure unless the options say quiet.
+
+    Samples that were left out are said at the end, with ``EXIT_SOME_FAILED``.
+    """
     check_out(options.out)
     result = measure(options)
     if isinstance(result, Path) and not options.quiet:
         typer.echo(result)
     elif result is not None and not options.quiet:
         _print_page(result)
+    if broken := getattr(result, "broken", ()):
+        some = ", ".join(broken[:MOST_NAMES]) + ", ..." * (len(broken) > MOST_NAMES)
+        count = "1 broken sample was" if len(broken) == 1 else f"{len(broken)} broken samples were"
+        say(f"geodiff: {count} left out: {some}. The same command tries them again.")
+        sys.exit(EXIT_SOME_FAILED)
 
 
 def _print_page(page: Page) -> None:

@@ -41,11 +41,11 @@ from geodiff_plugin.evaluation.baselines.unguided import sweep
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, StereoSample, load
 from geodiff_plugin.evaluation.datasets.sample import depth_to_disparity
 from geodiff_plugin.evaluation.options import command_line
-from geodiff_plugin.evaluation.tables import Table
+from geodiff_plugin.evaluation.tables import Table, label_of
 from geodiff_plugin.formats import write_depth_npy
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.formats.out import write_text
-from geodiff_plugin.jobs.journal import Item, Journal, Record, Shard, fingerprint
+from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Record, Shard, fingerprint
 from geodiff_plugin.jobs.runner import Runner
 from geodiff_plugin.matching import match_volume
 from geodiff_plugin.result.confidence import RIGHT_WITHIN
@@ -81,6 +81,7 @@ class Page:
     facts: dict[str, Any]
     tables: tuple[Table, ...]
     remarks: tuple[str, ...]
+    broken: tuple[str, ...] = ()  # samples that are left out
 
     def origin(self) -> str:
         """One line: date, versions, machine."""
@@ -116,7 +117,11 @@ def run_experiment(
 ) -> Page | None:
     """Measure the cells without a record, and write the page; ``None`` while other shards have cells left."""
     records = measure_cells(cells, options, journal or f"{command}.jsonl")
-    return None if records is None else write_page(command, options, title, tables(records), remarks(records))
+    if records is None:
+        return None
+    page = write_page(command, options, title, tables(records), remarks(records))
+    broken = dict.fromkeys(label_of(record) for record in records if record.get("status") == BROKEN)
+    return replace(page, broken=tuple(broken))
 
 
 def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NAME) -> list[Record] | None:
@@ -133,7 +138,7 @@ def measure_cells(cells: Sequence[Item], options: Any, journal: str = RECORDS_NA
             [cell for cell in every if _sample_of(cell) in mine],
             records,
             noun="cell",
-            survives=(OSError, ValueError) if getattr(options, "skip_broken", False) else (),
+            survives=() if getattr(options, "stop_on_broken", True) else (OSError, ValueError),
             progress=not options.quiet,
             whole=_has_map,
         )

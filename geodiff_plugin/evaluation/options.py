@@ -143,7 +143,12 @@ class PairsOptions(SampleOptions):
     pixel_centre: float | None = declare(
         None, "Coordinate of the first pixel's centre in posed cameras: 0, or 0.5 as COLMAP has it."
     )
-    skip_broken: bool = declare(False, "Go on after a broken sample, and count it.", panel=OUTPUT)
+    stop_on_broken: bool = declare(
+        False, "End at the first broken sample, instead of leaving it out and saying so.", panel=OUTPUT
+    )
+    skip_broken: bool = declare(
+        False, "Does nothing any more: what it asked for is the default.", panel=OUTPUT
+    )
     save_depth: bool = declare(False, "Also write every depth map as .npy.", panel=OUTPUT)
 
 
@@ -270,7 +275,17 @@ def command_line(name: str, options: Any) -> str:
     """The command line that gives these options, defaults and what changes no number left out."""
     words, without = (
         [*options.program.split(), name],
-        ("out", "results", "quiet", "skip_broken", "save_depth", "engine", "workers", "gpus"),
+        (
+            "out",
+            "results",
+            "quiet",
+            "skip_broken",
+            "stop_on_broken",
+            "save_depth",
+            "engine",
+            "workers",
+            "gpus",
+        ),
     )
     for each in fields(options):
         value, rules = getattr(options, each.name), each.metadata

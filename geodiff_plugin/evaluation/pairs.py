@@ -229,7 +229,7 @@ def cost_table(records: Sequence[Record]) -> Table:
         peak = max(record["peak_bytes"] for record in group)
         costs[method] = _Cost(len(group), statistics.median(record["seconds"] for record in group), peak)
     if PLAIN not in costs:
-        cure = "See geodiff eval cost without --skip-broken for the reason."
+        cure = "See geodiff eval cost with --stop-on-broken for the reason."
         bad_value("the pairs", f"some on which {PLAIN} works", "none", cure)
     plain = costs[PLAIN]
     for method, cost in costs.items():

@@ -21,6 +21,8 @@ from geodiff_plugin.evidence.photographs import EstimatedRig, KnownLengths, esti
 from geodiff_plugin.evidence.prepare import make_evidence
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.formats import picture_size, read_calibration
+from geodiff_plugin.formats.images import in_stored_pixels
+from geodiff_plugin.formats.reading import is_as_stored
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Rig
@@ -74,6 +76,8 @@ class GeometryGuidance:
         evidence_store: cache of cost volumes and matches for further calls with the same images, cameras and
             settings; ``None``, the default, for no cache.
         estimated: cameras estimated by ``from_photographs``; ``None`` where poses were given.
+        as_stored: whether the cameras are those of the pixels as files store them, as COLMAP's are; then an
+            EXIF orientation of an image from memory is no reason to turn it.
         warned: every warning of the construction; one that ``forbids_trust`` makes the result untrusted.
         assumed: messages on inputs that were assumed because they were not given.
 
@@ -88,6 +92,7 @@ class GeometryGuidance:
     """
 
     estimated: EstimatedRig | None = None
+    as_stored: bool = False
 
     def __init__(
         self,
@@ -178,8 +183,10 @@ class GeometryGuidance:
                 path, cameras, image_names=image_names, image_size=size, baseline_m=baseline_m
             )
             defaults = {"left_size": rig.size_left, "unit": rig.unit, "measured_baseline": rig.measured}
+            as_stored = is_as_stored(path)
+            right = in_stored_pixels(right) if as_stored else right
             guidance = cls(right, (rig.K_left, rig.K_right), rig.E, **defaults | arguments)
-        guidance.warned = warned
+        guidance.warned, guidance.as_stored = warned, as_stored
         for image in guidance.rights:
             size = (image.shape[-1], image.shape[-2])
             cure = "Scale K with the images, or use these."

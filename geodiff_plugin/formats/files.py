@@ -24,6 +24,8 @@ if TYPE_CHECKING:  # what is wrong with a file is said before numpy is imported
 PathLike = str | os.PathLike[str]
 #: EXIF's tag of how an image is turned or mirrored; from 5 on its sides change places.
 ORIENTATION = 0x0112
+#: Its value for an image that is shown as it is stored.
+UPRIGHT = 1
 #: Its values that change anything.
 TURNS = range(2, 9)
 #: A number whose decimals follow a comma, alone between blanks, semicolons or the ends of a line.

@@ -11,7 +11,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from geodiff_plugin._checks import InputError, bad_type, bad_value, check_number, warn
-from geodiff_plugin.formats.files import ORIENTATION, TURNS, PathLike, open_image
+from geodiff_plugin.formats.files import ORIENTATION, TURNS, UPRIGHT, PathLike, open_image
 from geodiff_plugin.formats.rigs import intrinsics
 from geodiff_plugin.messages import Message
 
@@ -154,6 +154,20 @@ def picture_size(value: Any, name: str) -> tuple[int, int]:
         return value.size
     height, width, _ = _hwc(value, name).shape
     return width, height
+
+
+def in_stored_pixels(value: Any) -> Any:
+    """Images from memory as they lie there, for cameras of the stored pixels: nobody need turn them.
+
+    A copy of a PIL image whose EXIF orientation says so; a list or tuple of images entry by entry.
+    """
+    if isinstance(value, (list, tuple)):
+        return type(value)(map(in_stored_pixels, value))
+    if not isinstance(value, Image.Image) or value.getexif().get(ORIENTATION) not in TURNS:
+        return value
+    copy = value.copy()
+    copy.getexif()[ORIENTATION] = UPRIGHT
+    return copy
 
 
 def as_image_01(value: Any, name: str) -> torch.Tensor:

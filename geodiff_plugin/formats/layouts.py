@@ -191,13 +191,19 @@ def _stem(name: str) -> str:
     return (path.stem if path.suffix.lower() in IMAGES else name).lower()
 
 
+def _folder_name(name: str) -> str:
+    """A name that a folder of results can have: none of ``..``, not hidden, without control characters."""
+    printable = "".join(letter if letter.isprintable() else "_" for letter in name)
+    return f"_{printable.lstrip('.')}" if printable.startswith(".") else printable
+
+
 def unique_names(frames: Sequence[CaptureFrame]) -> list[str]:
     """A name for every frame that no other has: its own, with as many folders before it as it takes."""
     paths = [frame.image.parent.parts for frame in frames]
-    names = [frame.name for frame in frames]
+    names = [_folder_name(frame.name) for frame in frames]
     for folders in range(max(map(len, paths), default=0) + 1):
         pairs = zip(paths, names, strict=True)
         longer = ["-".join([*parts[max(0, len(parts) - folders) :], name]) for parts, name in pairs]
         if len(set(longer)) == len(longer):
-            return [name.replace("/", "-") for name in longer]
+            return [_folder_name(name.replace("/", "-")) for name in longer]
     return [f"{name}-{number}" for number, name in enumerate(names)]  # one file named twice

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -11,11 +12,17 @@ from typing import Any
 
 #: Takes one line for the user: ``say`` on the command line, ``silent`` in a program that wants none.
 Tell = Callable[[str], None]
+#: All but tabs and line ends.
+CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 
 
 def say(line: str) -> None:
-    """Print one line on stderr, apart from the results on stdout, and above a progress bar."""
+    """Print one line on stderr, apart from the results on stdout, and above a progress bar.
+
+    Control characters, which names in files may hold, are written out: no file commands the terminal.
+    """
+    line = CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", line)
     tqdm = sys.modules.get("tqdm")
     if tqdm is None:
         print(line, file=sys.stderr, flush=True)

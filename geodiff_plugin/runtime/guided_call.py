@@ -21,6 +21,7 @@ from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.inputs import left_images
+from geodiff_plugin.formats.images import in_stored_pixels
 from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.priors import DepthPrior, prior_of
 from geodiff_plugin.priors.pipeline import RESAMPLING, DepthDiffusionPipeline
@@ -114,7 +115,8 @@ class GuidedCall(_Stock):
         self, call: dict[str, Any], guidance: GeometryGuidance, callback: StepCallback | None, held: Exclusive
     ) -> tuple[GuidedRun, Any]:
         """Prepare the run and make the stock call; ``call`` is updated to its final arguments."""
-        lefts_01 = left_images(call["image"])  # (N, 3, H, W)
+        lefts = in_stored_pixels(call["image"]) if guidance.as_stored else call["image"]
+        lefts_01 = left_images(lefts)  # (N, 3, H, W)
         prior = prior_of(self)
         _check_arguments(call, len(lefts_01))
         asked = call["num_inference_steps"]

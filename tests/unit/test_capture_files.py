@@ -1,6 +1,7 @@
 """Readers of captures: every layout gives the same frames, and bad input a sentence."""
 
 import json
+import warnings
 from pathlib import Path
 
 import cv2
@@ -9,14 +10,17 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin import InputError
+from geodiff_plugin import GeometryGuidance, InputError
 from geodiff_plugin.capture.frames import Capture
+from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.clouds import Cloud
 from geodiff_plugin.formats.colmap import MODELS, write_colmap
+from geodiff_plugin.formats.images import in_stored_pixels
 from geodiff_plugin.formats.lenses import undistorted_pixels
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.reading import read_pair
+from geodiff_plugin.jobs.telling import say
 from tests.unit.capture_room import SIZE, K, render, walk, write_transforms
 
 TRUE = walk(4)
@@ -287,6 +291,44 @@ def test_a_pair_of_a_colmap_model_is_read_as_it_is_stored(orientation, tmp_path)
     inputs = read_pair(options)
     np.testing.assert_allclose(inputs.left, IMAGES[0] / 255, atol=1e-6)
     np.testing.assert_allclose(inputs.rig.K_left, K)
+
+
+@TURNED
+@pytest.mark.parametrize("write", [transforms, colmap_text], ids=lambda write: write.__name__)
+def test_nobody_is_told_to_turn_an_image_whose_camera_is_of_stored_pixels(write, orientation, tmp_path):
+    folder = write(tmp_path)
+    for image in (folder / "images").iterdir():
+        turn(image, orientation)
+    cameras = folder / ("transforms.json" if write is transforms else "sparse/0")
+    names = tuple(f"{'images/' if write is transforms else ''}f0{i}.png" for i in (0, 3))
+    with Image.open(folder / "images/f00.png") as left, Image.open(folder / "images/f03.png") as right:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            guidance = GeometryGuidance.from_calibration(right, cameras, image_names=names, baseline_m=0.33)
+            lefts_01 = left_images(in_stored_pixels(left))
+        assert guidance.as_stored and right.getexif()[ORIENTATION] == orientation
+        with pytest.warns(UserWarning, match="exif_transpose"):  # by K and E nobody knows it
+            GeometryGuidance(right, K, TRUE[0] @ np.linalg.inv(TRUE[3]))
+    np.testing.assert_allclose(guidance.rights[0].permute(1, 2, 0), IMAGES[3] / 255, atol=1e-6)
+    np.testing.assert_allclose(lefts_01[0].permute(1, 2, 0), IMAGES[0] / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("stem", ["..", ".hidden", "a\nb", "\x1b[31mred"])
+def test_a_hostile_name_stays_inside_the_output_and_out_of_the_terminal(stem, tmp_path, capsys):
+    folder = write_transforms(tmp_path / "scan", TRUE, TRUE)
+    data = json.loads((folder / "transforms.json").read_text())
+    (folder / "images/f01.png").rename(folder / f"images/{stem}.png")
+    data["frames"][1]["file_path"] = f"images/{stem}.png"
+    (folder / "transforms.json").write_text(json.dumps(data))
+    names = Capture.open(folder).names
+    assert len(names) == 4
+    assert all(name.isprintable() and not name.startswith(".") and "/" not in name for name in names)
+    data["frames"][1]["file_path"] = f"../../../{stem}\x1b[2J.png"  # nothing there
+    (folder / "transforms.json").write_text(json.dumps(data))
+    left = Capture.open(folder)
+    assert len(left) == 3
+    say(left.notes[0])
+    assert "\x1b" not in capsys.readouterr().err
 
 
 def test_images_of_one_name_in_two_folders_stay_apart(tmp_path):

@@ -10,7 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+from geodiff_plugin.cli.eval import eval_app
+from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED
 from geodiff_plugin.evaluation import experiment, pairs, paper
 from geodiff_plugin.evaluation.baselines import (
     FAMILIES,
@@ -59,13 +62,17 @@ def test_pairs_selects_draws_and_says_so(data, tmp_path):
     assert "Drawn with seed 0: middlebury2014/" in drawn[0]
 
 
-def test_pairs_goes_on_after_a_broken_sample_on_request_and_tries_it_again(data, tmp_path):
+def test_pairs_goes_on_after_a_broken_sample_says_so_at_the_end_and_tries_it_again(data, tmp_path):
     picture = data / "one" / "im1.png"
     words = ("pairs", data, "--methods", "sgbm,sweep-sgm", "-o", tmp_path / "out")
     picture.rename(tmp_path / "kept.png")
     with pytest.raises(FileNotFoundError, match=r"im1\.png"):
-        invoke(*words)
-    said = invoke(*words, "--skip-broken")
+        invoke(*words, "--stop-on-broken")
+    answer = CliRunner().invoke(eval_app, [str(word) for word in words])
+    assert answer.exit_code == EXIT_SOME_FAILED
+    left_out = "geodiff: 1 broken sample was left out: middlebury2014/one. The same command tries them again."
+    assert answer.stderr.splitlines()[-1] == left_out
+    said = invoke(*words, "--skip-broken")  # what was asked for by that is the default
     assert "1 broken sample was skipped" in said and said.count("im1.png") == 1
     assert "(sgbm, sweep-sgm)" in said
     (tmp_path / "kept.png").rename(picture)
