@@ -263,6 +263,7 @@ MESSAGES: dict[str, MessageKind] = {
         "The matches do not determine the pose",
         cause="The cameras stood close together, or few things match: a turn and a step look alike.",
         cure="Give a more exact pose, or views from further apart.",
+        forbids_trust=True,
     ),
     "pose.residual": MessageKind(
         "Matches lie 2 to 4 px off their epipolar lines",

@@ -94,23 +94,27 @@ class _Observations(NamedTuple):
 def _observations(depth_m: Tensor, target: Matches, left_01: Tensor, config: GuidanceConfig) -> _Observations:
     size = target.size
     guide = F.interpolate(left_01.float(), size, mode="bilinear", antialias=True)
-    log_depth = _log_depth(depth_m, size)
+    log_depth = log_depth_at(depth_m, size)
     matched, step = target.inverse_depth.clamp_min(1e-9), target.plane_step.view(-1, 1, 1, 1)
     noise = ((step / matched) ** 2 + config.match_noise**2).sqrt()
     weight = target.confidence * (config.match_noise / noise) ** 2
     residual = torch.where(weight > 0, matched.log() + log_depth, torch.zeros_like(matched))
     right = (weight * target.confidence.clamp_max(1.0)).flatten(1).sum(1, keepdim=True)
     correct_share = right / weight.flatten(1).sum(1, keepdim=True).clamp_min(1e-9)
-    across, down = (_links(guide, log_depth, axis) for axis in (-1, -2))
+    across, down = (edge_links(guide, log_depth, axis) for axis in (-1, -2))
     return _Observations(residual, noise, weight, correct_share, (across, down))
 
 
-def _log_depth(depth_m: Tensor, size: tuple[int, int]) -> Tensor:
+def log_depth_at(depth_m: Tensor, size: tuple[int, int]) -> Tensor:
+    """The log of a map ``(B, 1, H, W)`` on another grid."""
     return F.interpolate(depth_m.float().log(), size, mode="bilinear", align_corners=False)
 
 
-def _links(guide: Tensor, log_depth: Tensor, axis: int) -> Tensor:
-    """Strength with which neighbours along an axis share a correction, one per pair of them."""
+def edge_links(guide: Tensor, log_depth: Tensor, axis: int) -> Tensor:
+    """Strength with which neighbours along an axis share a correction, one per pair of them.
+
+    ``guide (B, 3, h, w)`` and ``log_depth (B, 1, h, w)`` lie on one grid; it falls at the edges of both.
+    """
     scale = max(guide.shape[-2:]) / REFERENCE_SIDE
     step = guide.diff(dim=axis).abs().mean(1, keepdim=True) / IMAGE_EDGE
     jump = log_depth.diff(dim=axis).abs() / DEPTH_EDGE
@@ -173,7 +177,7 @@ def off_edges(target: Matches, depth_m: Tensor, error: Tensor) -> Matches:
     window and do not belong here. Above ``EDGE_ERROR`` a prior errs in its edges: matches lose less.
     """
     size = target.size
-    log_depth = _log_depth(depth_m, size)
+    log_depth = log_depth_at(depth_m, size)
     reach = max(1, round(EDGE_REACH * max(size)))
     span = range_around(log_depth, reach)
     width = EDGE_STEP * (_on_grid(error, size) / EDGE_ERROR).clamp_min(1.0) ** 3

@@ -29,6 +29,18 @@ AGREEMENT_PLANES = 1.5
 CONTRAST_REACH = 15
 #: The least such difference, as a share of the largest cost.
 LEAST_CONTRAST = 0.03
+#: Doubt, one less the probability of a match, at which its standard deviation is one plane: on pairs with
+#: truth the error of matches grows with the root of their doubt.
+DOUBT_OF_A_PLANE = 0.04
+#: Sharpness, averaged like the contrast, below which the deviation grows in inverse proportion: where the
+#: costs of near planes are alike, noise chooses among them.
+LEAST_SHARPNESS = 0.1
+#: Half width in px of the window over which the precision of matches is averaged: that of the contrast.
+KNOWN_REACH = CONTRAST_REACH
+#: Mean precision, one over squared planes, of a window in which the matches know enough.
+ENOUGH_KNOWN = 0.3
+# It grows by this factor at most.
+_MOST_BLUR = 100.0
 # Only every second row of the right view is matched.
 _EVERY_ROW = 2
 
@@ -127,6 +139,7 @@ class Candidates(NamedTuple):
 
     inverse_depth: Tensor  # (H, W) 1/m
     contrast: Tensor  # (H, W) how far their cost is below the mean plane's, averaged over a window
+    sharpness: Tensor  # (H, W) the same below the mean of near planes (``Winner.sharpness``)
     views: Iterator[ViewEvidence]  # of every right view, made as it is asked for
 
 
@@ -148,9 +161,9 @@ def candidates(volume: CostVolume, views: Sequence[AlignedView]) -> Candidates:
             features = torch.stack([torch.ones_like(margin), (margin + 0.03).log(), cost, differs])
             yield ViewEvidence(features, difference)
 
-    contrast = _window_mean(found.gain, CONTRAST_REACH)
+    contrast, sharpness = (_window_mean(each, CONTRAST_REACH) for each in (found.gain, found.sharpness))
     inverse_depth = volume.inverse_depth[0] + position * volume.plane_step
-    return Candidates(inverse_depth, contrast, evidence())
+    return Candidates(inverse_depth, contrast, sharpness, evidence())
 
 
 @torch.no_grad()
@@ -160,13 +173,37 @@ def match_volume(volume: CostVolume) -> Matches:
     Confidence is 0 where no right view agrees, else about the probability that the match is within
     three planes of the truth, by the right view that is most certain of it.
     """
-    inverse_depth, contrast, views = candidates(volume, volume.aligned)
-    confidence = torch.zeros_like(inverse_depth)
-    for features, difference in views:
+    found = candidates(volume, volume.aligned)
+    confidence = torch.zeros_like(found.inverse_depth)
+    for features, difference in found.views:
         odds = torch.zeros_like(difference)
         for weight, x in zip(LOG_ODDS, features, strict=True):
             odds = odds + weight * x
-        probability = torch.sigmoid(odds) * (contrast / LEAST_CONTRAST).clamp_max(1.0)
+        probability = torch.sigmoid(odds) * (found.contrast / LEAST_CONTRAST).clamp_max(1.0)
         agreed = torch.where(difference <= AGREEMENT_PLANES, probability, torch.zeros_like(probability))
         confidence = torch.maximum(confidence, agreed)
-    return Matches(inverse_depth[None], confidence[None], to_device_of(confidence, volume.plane_step))
+    deviation = _deviation(confidence, found.sharpness)
+    step = to_device_of(confidence, volume.plane_step)
+    return Matches(found.inverse_depth[None], confidence[None], step, deviation[None])
+
+
+def _deviation(confidence: Tensor, sharpness: Tensor) -> Tensor:
+    """Standard deviation of matches in planes, ``(H, W)``."""
+    blur = LEAST_SHARPNESS / sharpness.clamp_min(LEAST_SHARPNESS / _MOST_BLUR)
+    return ((1.0 - confidence) / DOUBT_OF_A_PLANE).sqrt() * blur.clamp_min(1.0)
+
+
+@torch.no_grad()
+def known_share(matches: Matches) -> Tensor:
+    """How much the matches around every pixel know, ``(B, 1, H, W)`` in [0, 1].
+
+    It is the mean precision, one over the variance in planes and at most 1, of a window of matches, as a
+    share of ``ENOUGH_KNOWN``; a pixel without a match has none, a known point that of the pixels that it
+    stands for (see ``with_points``). 1 where no deviation is known.
+    """
+    if matches.deviation is None:
+        return torch.ones_like(matches.confidence)
+    precision = matches.deviation.clamp_min(1.0) ** -2 * matches.confidence.clamp_min(1.0)
+    precision = torch.where(matches.confidence > 0, precision, torch.zeros_like(precision))
+    mean = torch.stack([_window_mean(of_image[0], KNOWN_REACH)[None] for of_image in precision])
+    return (mean / ENOUGH_KNOWN).clamp_max(1.0)

@@ -18,12 +18,13 @@ from geodiff_plugin._kernels import launched_on
 from geodiff_plugin.geometry import to_device_of
 from geodiff_plugin.matching.alignment import AlignedView, even_shifts
 from geodiff_plugin.matching.census import COST_LEVELS, MARGIN_PX, SIDE, VOTE_LEVELS, grey_levels
-from geodiff_plugin.matching.winner import NEVER, PACKED_PLANES, UNSEEN_LEVEL, Winner
+from geodiff_plugin.matching.winner import BESIDE_PLANES, NEVER, PACKED_PLANES, UNSEEN_LEVEL, Winner
 
 # A kernel reads constants of its module only as these.
 _NEVER = tl.constexpr(NEVER)
 _PACKED_PLANES = tl.constexpr(PACKED_PLANES)
 _UNSEEN_LEVEL = tl.constexpr(UNSEEN_LEVEL)
+_BESIDE_PLANES = tl.constexpr(BESIDE_PLANES)
 _COST_LEVELS = tl.constexpr(COST_LEVELS)
 #: Pixels and planes of a program of the sweep.
 COST_BLOCK = 32, 16
@@ -146,6 +147,7 @@ def winner_kernel(
     best_out,
     runner_up_out,
     gain_out,
+    sharpness_out,
     planes,
     pixels,
     width,
@@ -184,10 +186,16 @@ def winner_kernel(
         mean = tl.div_rn(of_seen, tl.maximum(seen, 1).to(tl.float32))
         own = tl.sum(tl.where(away == 0, cost, 0), 1).to(tl.float32)
         gain = tl.div_rn(tl.maximum(mean - own, 0.0), tl.full([BLOCK], _COST_LEVELS, tl.float32))
+        lower = tl.maximum(index - _BESIDE_PLANES, 0)[:, None]
+        upper = tl.minimum(index + _BESIDE_PLANES, planes - 1)[:, None]
+        beside = tl.sum(tl.where(plane == lower, cost, 0) + tl.where(plane == upper, cost, 0), 1)
+        largest = tl.full([BLOCK], 2 * _COST_LEVELS, tl.float32)
+        sharpness = tl.div_rn(beside.to(tl.float32) - 2.0 * own, largest)
         runner_up = tl.min(tl.where((away < -1) | (away > 1), sums, _NEVER), 1)
         tl.store(best_out + pixel, best, mask=inside)
         tl.store(runner_up_out + pixel, runner_up.to(tl.float32), mask=inside)
         tl.store(gain_out + pixel, gain, mask=inside)
+        tl.store(sharpness_out + pixel, sharpness, mask=inside)
 
 
 def winner_positions(total: Tensor) -> Tensor:
@@ -206,8 +214,8 @@ def _winner(total: Tensor, evidence: tuple[Tensor, Tensor] | None) -> list[Tenso
     block = max(1, _SUMS_AT_ONCE // padded)
     # Without evidence its pointers are not used.
     levels, in_view = evidence or (total, total)
-    maps = torch.empty(4 if evidence else 1, height, width, dtype=torch.float32, device=total.device)
-    outputs = list(maps) if evidence else [maps[0]] * 4
+    maps = torch.empty(5 if evidence else 1, height, width, dtype=torch.float32, device=total.device)
+    outputs = list(maps) if evidence else [maps[0]] * 5
     launched_on(total, winner_kernel[(triton.cdiv(height * width, block),)])(
         total,
         levels,

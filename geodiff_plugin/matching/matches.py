@@ -51,6 +51,9 @@ class Matches:
     inverse_depth: Tensor  # float32, 1/m; defined everywhere, to be read where ``confidence > 0``
     confidence: Tensor  # 0 where nothing is matched or known
     plane_step: Tensor  # () or (B,) 1/m, the unit of errors: a plane, or ``UNIT`` of the points' median
+    deviation: Tensor | None = (
+        None  # like ``confidence``, of a match in plane steps; ``None`` is 1 everywhere
+    )
     _above: dict[float, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @classmethod
@@ -60,7 +63,11 @@ class Matches:
         if len(given) < len(images):
             return None
         names = ("inverse_depth", "confidence", "plane_step")
-        return cls(*(torch.stack([getattr(matches, name) for matches in given]) for name in names))
+        inverse_depth, confidence, step = (torch.stack([getattr(m, name) for m in given]) for name in names)
+        deviations = [matches.deviation for matches in given]
+        known = [each for each in deviations if each is not None]
+        deviation = torch.stack(known) if len(known) == len(given) else None
+        return cls(inverse_depth, confidence, step, deviation)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -141,6 +148,7 @@ def with_points(matches: Matches | None, points: Matches) -> Matches:
         matches,
         inverse_depth=torch.where(given, points.inverse_depth, matches.inverse_depth),
         confidence=torch.where(given, confidence, matches.confidence),
+        deviation=None if matches.deviation is None else torch.where(given, 1.0, matches.deviation),
     )
 
 

@@ -15,6 +15,8 @@ NEVER = 20_000
 UNSEEN_LEVEL = 78
 #: Packs a sum over the paths and its plane into one integer, so that one minimum finds both.
 PACKED_PLANES = 1 << 12
+#: Planes to both sides of the winner whose costs say how sharp it is: beyond the width of a textured minimum.
+BESIDE_PLANES = 4
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class Winner:
     best: Tensor  # its sum over the paths
     runner_up: Tensor  # the least sum of a plane that is not its neighbour; ``NEVER`` where there is none
     gain: Tensor  # how far its cost is below the mean of the planes that are seen, as a share of the largest
+    sharpness: Tensor  # the same below the mean of the planes ``BESIDE_PLANES`` away; may be negative
 
 
 def _around(total: Tensor) -> tuple[Tensor, Tensor]:
@@ -61,7 +64,8 @@ def winner(total: Tensor, levels: Tensor, in_view: Tensor) -> Winner:
     sums = total.gather(0, around).float()
     runner_up = total.scatter_(0, around, NEVER).amin(dim=0).float()
     position = _position(index, sums, len(total) - 1)
-    return Winner(position, sums[1], runner_up, _gain(index, levels, in_view))
+    gain, sharpness = _gain(index, levels, in_view), _sharpness(index, levels)
+    return Winner(position, sums[1], runner_up, gain, sharpness)
 
 
 def _gain(index: Tensor, levels: Tensor, in_view: Tensor) -> Tensor:
@@ -71,3 +75,9 @@ def _gain(index: Tensor, levels: Tensor, in_view: Tensor) -> Tensor:
         seen += seen_on_plane
     mean = (total - UNSEEN_LEVEL * (len(levels) - seen)).float() / seen.clamp_min(1)
     return (mean - levels.gather(0, index[None])[0]).clamp_min(0.0) / COST_LEVELS
+
+
+def _sharpness(index: Tensor, levels: Tensor) -> Tensor:
+    steps = torch.tensor([0, -BESIDE_PLANES, BESIDE_PLANES], device=index.device)[:, None, None]
+    own, below, above = levels.gather(0, (index + steps).clamp_(0, len(levels) - 1)).float()
+    return (below + above - 2.0 * own) / (2 * COST_LEVELS)

@@ -71,6 +71,11 @@ _CAUSES = (
     "another order of the views, or world-to-camera poses for camera-to-world ones."
 )
 
+_DRIFT = (
+    "Likely cause: a rig that has drifted since it was calibrated. Calibrate it anew, or keep its "
+    "calibration (pose='given', --knob pose=given)."
+)
+
 _Refined = tuple[tuple[CameraView, ...], PoseReport]
 """The right views that everything downstream works with, and the report."""
 
@@ -105,7 +110,8 @@ def refine_views(
 
     ``measured`` baselines keep their lengths, as those of a rectified rig do; others are weighed against the
     depth of the scene. The given views are returned if they fit, if there are too few matches, if a mistake
-    explains the misfit, or if no better pose is near.
+    explains the misfit, or if no better pose is near. A rectified rig is refined only if the dense matches
+    miss it as well.
     """
     views, given = grey_views(left_01, rights, K_left), _poses(rights)
     sparse = sparse_tracks(views)
@@ -127,6 +133,11 @@ def refine_views(
         return tuple(rights), report
     depth_m = coarse_depth(left_01, _applied(rights, near), K_left, views[0][0].shape)
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
+    if rig and not ((all_px := median_residuals(tracks, given)) > fits_px).any():
+        # The few sparse matches missed by chance: a calibration is not changed for what all do not show.
+        residual_px, matches = tuple(all_px.tolist()), tuple(map(float, tracks.seen.sum(1)))
+        report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
+        return tuple(rights), report
     sizes = [(image.shape[0], image.shape[1]) for image, _ in views[1:]]
     return _refined(_Misfit(rights, sizes, tracks, given, near, fits_px, rig, measured), report)
 
@@ -142,7 +153,7 @@ def _refined(misfit: _Misfit, report: PoseReport) -> _Refined:
     after, worst = median_residuals(tracks, Ts), int(np.argmax(np.nan_to_num(before)))
     residual_px, matches = tuple(before.tolist()), tuple(map(float, tracks.seen.sum(1)))
     report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
-    doubts = undecided(tracks, Ts, free)
+    doubts = () if misfit.rig else undecided(tracks, Ts, free)  # a calibration determines the pose
     if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
         warnings = _kept_misfit(before, worst) + doubts
         return tuple(rights), replace(report, status="kept", warnings=warnings)
@@ -163,7 +174,7 @@ def _refined(misfit: _Misfit, report: PoseReport) -> _Refined:
     report = replace(
         report,
         status="refined",
-        warnings=_refined_misfit(before, after, worst) + doubts,
+        warnings=_refined_misfit(before, after, worst, misfit.rig) + doubts,
         scale_spread=spread,
         behind_infinity=behind_infinity(tracks, Ts),
         E=_as_E(Ts),
@@ -327,9 +338,9 @@ def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[Message
     return (Message("pose.undetermined", sentence),)
 
 
-def _misses(before: np.ndarray, v: int) -> str | None:
+def _misses(before: np.ndarray, v: int, least_px: float = WARNS_PX) -> str | None:
     """How far view ``v``'s pose as given misses the matches; ``None`` if no view is worth a warning."""
-    if not np.nanmax(before) > WARNS_PX:
+    if not np.nanmax(before) > least_px:
         return None
     pose = "The pose as given" if len(before) == 1 else f"The pose of right view {v + 1} as given"
     return f"{pose} leaves matches {before[v]:.1f} px off their epipolar lines in the median"
@@ -342,11 +353,13 @@ def _kept_misfit(before: np.ndarray, v: int) -> tuple[Message, ...]:
     return (Message("pose.kept", f"{misses}, and no pose near it leaves clearly less. {_CAUSES}"),)
 
 
-def _refined_misfit(before: np.ndarray, after: np.ndarray, v: int) -> tuple[Message, ...]:
-    misses = _misses(before, v)
+def _refined_misfit(before: np.ndarray, after: np.ndarray, v: int, rig: bool) -> tuple[Message, ...]:
+    """A rig whose calibration is changed is always told so, since it stands for being exact."""
+    misses = _misses(before, v, FITS_PX if rig else WARNS_PX)
     if misses is None:
         return ()
-    return (Message("pose.refined", f"{misses}, a refined one {after[v]:.1f} px. {_CAUSES}"),)
+    causes = _CAUSES if np.nanmax(before) > WARNS_PX else _DRIFT
+    return (Message("pose.refined", f"{misses}, a refined one {after[v]:.1f} px. {causes}"),)
 
 
 def _too_far(

@@ -13,6 +13,7 @@ from geodiff_plugin._kernels import launch_bound
 from geodiff_plugin._strips import STRIP_PIXELS, row_strips
 from geodiff_plugin.algorithm.terms import match_exposure
 from geodiff_plugin.geometry import as_fine_as, image_size, warp_right_to_left
+from geodiff_plugin.matching import Matches, known_share
 from geodiff_plugin.types import CameraView
 
 #: Standard deviation of a good match, pixels of the left image.
@@ -40,9 +41,17 @@ _MOST_LEFT = 0.05
 _BEST = 0.01
 # The error of a useless prior.
 _USELESS = 0.5
+#: Known share of the matches around a pixel from which on they determine what their support says.
+DETERMINED_FROM = 0.33
 # Support at which the prior's error is half known: it is measured where there are matches, and a prior that
 # is right on the street may be wrong on the trees above it.
 _HALF_KNOWN = 0.1
+
+
+def determined(target: Matches, size: tuple[int, int]) -> Tensor:
+    """How far matches determine a depth, ``(1, 1, H, W)`` in [0, 1]: less where they know little."""
+    share = (known_share(target) / DETERMINED_FROM).clamp_max(1.0)
+    return F.interpolate(share, size, mode="bilinear", align_corners=False)
 
 
 def depth_evidence(

@@ -21,8 +21,9 @@ from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.geometry import image_size, resize_intrinsics
 from geodiff_plugin.matching import Matches, build_cost_volume, match_volume
 from geodiff_plugin.messages import Message
-from geodiff_plugin.result.confidence import depth_confidence, reprojection
+from geodiff_plugin.result.confidence import depth_confidence, determined, reprojection
 from geodiff_plugin.result.ensemble import ensemble_metric, median, spread_around
+from geodiff_plugin.result.flattening import flatten
 from geodiff_plugin.result.indicators import indicators_of, measure_indicators, read_numbers
 from geodiff_plugin.result.verdict import judge, points_agreement
 from geodiff_plugin.result.voting import vote_depth
@@ -179,7 +180,7 @@ def _error_of(members: Sequence[Member]) -> Tensor | None:
 def refine(
     evidence: Evidence, members: Sequence[Member], depth_m: Tensor, left_01: Tensor, config: GuidanceConfig
 ) -> Refined | None:
-    """Sharpen the edges of a map of these members, fit it to its matches, and let these vote.
+    """Sharpen the edges of a map of these members, fit it to its matches, flatten it, and let these vote.
 
     Edges are sharpened first: then the fit does not carry the depth of one surface over to the next.
     ``left_01 (1, 3, H, W)`` has the size of the map. ``None`` if there are neither matches nor points.
@@ -195,10 +196,12 @@ def refine(
         return None
     fitted_m, support, _ = fit_depth(depth_m, target, evidence.native.left_01[None], error, config)
     if matches is not None:
+        measured = error.amin((2, 3), keepdim=True)  # its value where the prior gives a depth
+        fitted_m = flatten(fitted_m, target, left_01, measured)
         target = correction_target(matches, points, weight, error, fitted_m)
         assert target is not None  # there are matches
-        measured = error.amin((2, 3), keepdim=True)  # its value where the prior gives a depth
         fitted_m = vote_depth(fitted_m, evidence.native, target, measured, spacing)
+        support = support * determined(target, image_size(support))
     return Refined(fitted_m, support)
 
 

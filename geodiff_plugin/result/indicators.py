@@ -134,8 +134,7 @@ def indicators_of(
         for name, residuals in (("epipolar_px", pose.residual_px), ("given_px", pose.residual_px_given)):
             known[name] = max((px for px in residuals if not math.isnan(px)), default=math.nan)
         known |= {"behind_infinity": pose.behind_infinity, "distortion": pose.distortion}
-        if pose.status == "mistaken":
-            known["mistakes"] = tuple(m for m in pose.warnings if m.code != INVERSE.code)
+        known["mistakes"] = tuple(m for m in pose.warnings if m.forbids_trust and m.code != INVERSE.code)
     if native.views and has_unit:
         known["scale_spread"] = (pose and pose.scale_spread) or math.nan
     half_width = 0.5 * native.size[1]

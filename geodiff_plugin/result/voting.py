@@ -21,7 +21,7 @@ from geodiff_plugin._kernels import launch_bound
 from geodiff_plugin.algorithm.correction import highest, range_around
 from geodiff_plugin.algorithm.edges import HALF, REACH, STRIP
 from geodiff_plugin.geometry import image_size, is_rectified, resize_image, to_device_of
-from geodiff_plugin.matching import Matches
+from geodiff_plugin.matching import Matches, known_share
 from geodiff_plugin.matching.rows import match_rows
 from geodiff_plugin.types import CameraView, PosedViews
 
@@ -89,9 +89,10 @@ def vote_depth(
     ``w_i`` their weights, the surface is the weighted median ``m = argmin_d sum_i w_i |d_i - d|``. The result
     is the mean of the votes near it, ``sum_i v_i d_i / sum_i v_i``, ``v_i = w_i / (1 + (d_i - m)^2 /
     NEAR_PX^2)^2``. The map votes for its own ``d_0`` with a fixed weight, and a match of confidence ``c`` at
-    the distance ``r`` in samples with ``w = c exp(-r^2 / (2 REACH^2)) exp(-|I - I_i| / BRIGHTNESS) /
+    the distance ``r`` in samples with ``w = k c exp(-r^2 / (2 REACH^2)) exp(-|I - I_i| / BRIGHTNESS) /
     (1 + (log d_i / d_0)^2 / (DIFFERS s)^2)^2``: less with another colour ``I``, and less the more standard
-    deviations ``s``, of match and map together, it differs from the map.
+    deviations ``s``, of match and map together, it differs from the map. Where the matches of a place know
+    little, as on a blank wall, all of them count less: ``k`` is their ``known_share``.
 
     Rows of a rectified view are matched again at this resolution, for edges that the sweep's grid cannot
     resolve; without such a view of the left image's size the map is returned unchanged.
@@ -116,9 +117,9 @@ def vote_depth(
     left, K = _resized(native.left_01, native.K_left, size)
     right = CameraView(*_resized(view.image_01, view.K, size), view.T_right_from_left)
     # Nearest: a mean across an edge is the depth of neither surface.
-    small_m, inverse_depth, confidence = (
+    small_m, inverse_depth, confidence, known = (
         F.interpolate(each.float(), size, mode="nearest-exact")[0, 0]
-        for each in (depth_m, target.inverse_depth, target.confidence)
+        for each in (depth_m, target.inverse_depth, target.confidence, known_share(target))
     )
     px = (K[0, 0] * view.T_right_from_left[0, 3]).abs()  # shift of a depth of 1 m
     shift, matched_px = px / small_m, px * inverse_depth
@@ -126,8 +127,9 @@ def vote_depth(
     nearest = torch.maximum(inverse_depth.amax(), 1.0 / small_m.amin()) * px
     of_rows, matched, filled = match_rows(left, right, K, float(nearest))
     voters = (
-        _weighed(_Votes(of_rows, ROWS * matched + FILLED * filled), shift, error),
-        _weighed(_Votes(matched_px, confidence.clamp(0.0, 1.0)), shift, error),  # a known point's is a count
+        _weighed(_Votes(of_rows, known * (ROWS * matched + FILLED * filled)), shift, error),
+        # The confidence of a known point is a count.
+        _weighed(_Votes(matched_px, known * confidence.clamp(0.0, 1.0)), shift, error),
     )
     map_vote = MAP_VOTE * (WEAK_PRIOR / error).clamp_min(1.0) ** 3
     voted = _vote_in_windows(voters, left, shift, map_vote)

@@ -180,7 +180,7 @@ def observe_matches(sample: StereoSample, settings: Settings, priors: PriorCache
     """
     volume = sweep(sample, settings.device)
     with torch.no_grad():
-        inverse_depth, contrast, views = consistency.candidates(volume, volume.aligned[:1])
+        inverse_depth, contrast, _, views = consistency.candidates(volume, volume.aligned[:1])
         (view,) = views
     agreed, textured = view.difference <= consistency.AGREEMENT_PLANES, contrast >= consistency.LEAST_CONTRAST
     truth = torch.from_numpy(np.where(sample.valid, sample.depth_m, 0.0)).float()[None, None]

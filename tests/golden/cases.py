@@ -20,6 +20,7 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior, read_calibration
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
+from geodiff_plugin.evaluation.datasets import find_pairs, load
 from tests.conftest import plane_pair
 from tests.contracts.tiny_priors import CALL, TINY
 
@@ -117,6 +118,15 @@ def of_small(**options: Any) -> Callable[[Callable[..., GeometryGuidance]], Call
 def default_bundled_pair() -> Result:
     left, right, rig, _ = pair()
     return maps_of(call(bundled_prior(), left, GeometryGuidance(right, (rig.K_left, rig.K_right), rig.E)))
+
+
+@case
+def plain_wall() -> Result:
+    """A rendered room of plain walls, whose matches know little."""
+    (ref,) = find_pairs("synthetic-plain:1@320x240")
+    sample = load(ref)
+    guidance = GeometryGuidance(sample.right, (sample.K_left, sample.K_right), sample.E)
+    return maps_of(call(bundled_prior(), Image.fromarray(sample.left), guidance))
 
 
 @of_small(num_inference_steps=3)

@@ -13,7 +13,14 @@ FROZEN = json.loads(STORED.read_text())
 TOLERANCE, NEAR_ZERO = 0.02, 0.02
 NEEDS_POSELIB = {"estimated_pose"}
 #: One of each way through the method; ``test_parts.py`` guards its numbers closer, and the rest is slow.
-FAST = ("default_bundled_pair", "preset_paper", "preset_marigold_dc", "points_and_view", "three_views")
+FAST = (
+    "default_bundled_pair",
+    "plain_wall",
+    "preset_paper",
+    "preset_marigold_dc",
+    "points_and_view",
+    "three_views",
+)
 
 
 # The verdict is one of the frozen results: of some cases it is that they are not to be trusted.

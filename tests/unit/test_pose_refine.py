@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.pose import refine
 from geodiff_plugin.pose.lens import remaining_distortion
 from geodiff_plugin.pose.mistakes import find_mistake
 from geodiff_plugin.pose.refine import fit_displacement, refine_views, straightened, undecided
@@ -361,3 +362,34 @@ def test_the_rows_of_a_rig_that_has_drifted_agree_again(seed: int) -> None:
     assert report.status == "refined"
     assert report.residual_px[0] < 0.3 < 0.45 < report.residual_px_given[0]
     assert np.linalg.norm(report.E[0][:3, 3]) == pytest.approx(float(rig.E[0, 3]), rel=0.03)
+
+
+def test_a_calibrated_rig_keeps_its_calibration_where_all_matches_fit_it(monkeypatch) -> None:
+    """The sparse matches alone miss it by chance; no millimetre of vertical baseline is made of that."""
+    rig = render_pair(3, size=(240, 320))
+    T = torch.from_numpy(np.linalg.inv(rig.E.numpy())).float()
+    views = [CameraView(rig.right.image_01.float(), rig.K_right.float(), T)]
+    given = rig.left.image_01.float(), views, rig.K_left.float()
+    sparse_tracks = refine.sparse_tracks
+
+    def missing(images):
+        sparse = sparse_tracks(images)
+        return replace(sparse, right_px=sparse.right_px + np.array([0.0, 0.6]))
+
+    monkeypatch.setattr(refine, "sparse_tracks", missing)
+    used, report = refine_views(*given)
+    assert report.status == "fits" and used[0] is views[0]
+    assert report.residual_px_given[0] < refine.FITS_PX and not report.warnings
+
+
+def test_a_rig_is_not_told_that_another_pose_fits_as_well(monkeypatch) -> None:
+    """Its calibration determines the pose; poses of a tracker do not, and forbid trust then."""
+    monkeypatch.setattr(refine, "_MOST_SPREAD", -1.0)  # however little the depths of the two differ
+    rig = render_pair(3, size=(240, 320))
+    for turn_deg, told in ((0.0, False), (0.7, True)):
+        E = rig.E.numpy() @ pose((turn_deg, 0.0, 0.0), (0, 0, 0))
+        right = torch.roll(rig.right.image_01.float(), 2, 1)  # two pixels down, so that neither pose fits
+        views = [CameraView(right, rig.K_right.float(), torch.from_numpy(np.linalg.inv(E)).float())]
+        _, report = refine_views(rig.left.image_01.float(), views, rig.K_left.float())
+        messages = [m for m in report.warnings if m.code == "pose.undetermined"]
+        assert bool(messages) == told and all(m.forbids_trust for m in messages), report

@@ -1,0 +1,110 @@
+"""Walls whose matches know little: what they know, how far a fit is followed, and flat slopes."""
+
+import pytest
+import torch
+
+from geodiff_plugin.matching import Matches, known_share, match_volume, sweep_planes, with_points
+from geodiff_plugin.matching.consistency import DOUBT_OF_A_PLANE, ENOUGH_KNOWN
+from geodiff_plugin.result.confidence import DETERMINED_FROM, determined
+from geodiff_plugin.result.flattening import flatten
+from geodiff_plugin.types import CameraView
+
+SIZE = (48, 64)
+WEAK = torch.full((1, 1, 1, 1), 0.2)
+
+
+def matches_of(deviation: float | None, confidence: float = 0.9) -> Matches:
+    whole = torch.ones(1, 1, *SIZE)
+    spread = None if deviation is None else deviation * whole
+    return Matches(0.5 * whole, confidence * whole, torch.tensor([0.01]), spread)
+
+
+def slanted(blotches: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """A plane's inverse depth, and its depth with blotches of this relative size."""
+    rows, columns = torch.meshgrid(*(torch.arange(side).float() for side in SIZE), indexing="ij")
+    plane = 0.3 + 0.002 * columns + 0.001 * rows
+    waves = torch.sin(columns / 3.0) * torch.cos(rows / 2.5)
+    return plane[None, None], (1.0 / (plane * (1.0 + blotches * waves)))[None, None]
+
+
+def off_plane(depth_m: torch.Tensor) -> float:
+    """RMS of the inverse depth from its best plane, as a share of the mean; least squares in float64."""
+    rows, columns = torch.meshgrid(*(torch.arange(side).double() for side in SIZE), indexing="ij")
+    terms = torch.stack([torch.ones(SIZE).double(), rows, columns], -1).reshape(-1, 3)
+    inverse = (1.0 / depth_m.double()).reshape(-1, 1)
+    residual = inverse - terms @ torch.linalg.lstsq(terms, inverse).solution
+    return float(residual.square().mean().sqrt() / inverse.mean())
+
+
+@pytest.mark.parametrize("deviation", [0.5, 1.0, 2.0, 4.0])
+def test_what_matches_know_is_their_mean_precision(deviation: float) -> None:
+    expected = min(1.0, min(1.0, deviation**-2) / ENOUGH_KNOWN)
+    torch.testing.assert_close(known_share(matches_of(deviation)), torch.full((1, 1, *SIZE), expected))
+
+
+def test_a_pixel_without_a_match_knows_nothing_and_points_stand_for_their_surroundings() -> None:
+    assert (known_share(matches_of(1.0, confidence=0.0)) == 0.0).all()
+    assert (known_share(matches_of(None)) == 1.0).all()
+    given = torch.zeros(1, 1, *SIZE)
+    given[..., ::8, ::8] = 1.0
+    points = Matches(0.5 * given, given, torch.tensor([0.01]))
+    known = known_share(with_points(matches_of(30.0), points))
+    assert (known[..., 16:-16, 16:-16] == 1.0).all()
+
+
+def test_matches_that_know_little_determine_little() -> None:
+    size = (96, 128)
+    assert (determined(matches_of(1.0), size) == 1.0).all()
+    wide = determined(matches_of(10.0), size)  # a precision of .01, of the .3 and of a third of it
+    torch.testing.assert_close(wide, torch.full((1, 1, *size), 0.01 / ENOUGH_KNOWN / DETERMINED_FROM))
+
+
+def test_blotches_of_a_slanted_wall_go_where_nothing_is_known_and_stay_where_all_is() -> None:
+    _, depth_m = slanted(0.04)
+    grey = torch.full((1, 3, *SIZE), 0.5)
+    flat = flatten(depth_m, matches_of(50.0), grey, WEAK)
+    assert off_plane(flat) < 0.3 * off_plane(depth_m)
+    kept = flatten(depth_m, matches_of(1.0), grey, WEAK)
+    torch.testing.assert_close(kept, depth_m, rtol=2e-3, atol=0.0)
+
+
+def test_a_plane_stays_a_plane_and_a_good_prior_keeps_its_relief() -> None:
+    grey = torch.full((1, 3, *SIZE), 0.5)
+    _, plane_m = slanted(0.0)
+    torch.testing.assert_close(flatten(plane_m, matches_of(50.0), grey, WEAK), plane_m, rtol=5e-3, atol=0.0)
+    _, relief_m = slanted(0.01)
+    good = torch.full((1, 1, 1, 1), 0.02)
+    kept = flatten(relief_m, matches_of(50.0), grey, good)
+    torch.testing.assert_close(kept, relief_m, rtol=3e-3, atol=0.0)
+
+
+def test_a_step_at_an_edge_of_the_image_stays() -> None:
+    size = 64, 512  # the width for which the strengths of edges hold
+    depth_m, image, whole = (
+        torch.full((1, 1, *size), 4.0),
+        torch.full((1, 3, *size), 0.2),
+        torch.ones(1, 1, *size),
+    )
+    depth_m[..., 256:], image[..., 256:] = 2.0, 0.9
+    matches = Matches(0.5 * whole, whole, torch.tensor([0.01]), 50.0 * whole)
+    torch.testing.assert_close(flatten(depth_m, matches, image, WEAK), depth_m, rtol=0.05, atol=0.0)
+
+
+def test_a_blank_wall_has_wide_matches_and_a_textured_one_narrow_ones() -> None:
+    """Two walls beside each other at one depth, the right one of nearly even paint, with sensor noise."""
+    generator = torch.Generator().manual_seed(0)
+    height, width, shift = 96, 160, 8
+    texture = torch.rand(1, height, width + shift, generator=generator)
+    texture[..., width // 2 :] = 0.5 + 0.004 * (texture[..., width // 2 :] - 0.5)
+    left, right = texture[..., :width], texture[..., shift:]
+    left, right = (x + 0.004 * torch.randn(x.shape, generator=generator) for x in (left, right))
+    K = torch.tensor([[100.0, 0, 80], [0, 100.0, 48], [0, 0, 1]])
+    T = torch.eye(4)
+    T[0, 3] = -0.1
+    planes = torch.linspace(0.0, 2.0, 32)  # inverse depths: the wall's is .8
+    matches = match_volume(sweep_planes(left, [CameraView(right, K, T)], K, planes))
+    assert matches.deviation is not None
+    narrow, wide = matches.deviation[0, 20:-20, 30:60], matches.deviation[0, 20:-20, 100:140]
+    assert narrow.median() < 2.0 < wide.median() / 2.0
+    sure = ((1.0 - matches.confidence[0, 20:-20, 30:60]) / DOUBT_OF_A_PLANE).sqrt()
+    assert (narrow >= sure - 1e-5).all()
