@@ -248,8 +248,8 @@ MUTANTS = [
         ("_HALF_KNOWN = 0.1", "_HALF_KNOWN = 0.12"),
         ("torch.minimum(best, error), best)", "error, best)"),
         (
-            "matched = match_exposure(warped[:, layer], left_01[:, layer], seen)",
-            "matched = warped[:, layer].clone()",
+            "matched = match_exposure(warped[:, channels], left_01[:, channels], seen)",
+            "matched = warped[:, channels].clone()",
         ),
         ("K_strip[:, 1, 2] -= rows.start", "K_strip[:, 1, 2] -= 0"),
         tests=(f"{UNIT}verdict.py", f"{UNIT}large_pictures.py"),
