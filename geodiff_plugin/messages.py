@@ -130,6 +130,11 @@ MESSAGES: dict[str, MessageKind] = {
         cause="Neither K nor a field of view was given.",
         cure="Nothing for a result that is good to a few per cent; calibrate the camera for more.",
     ),
+    "camera.filled-in": MessageKind(
+        "Numbers of the camera are assumed",
+        cause="Only a focal length was given.",
+        cure="Give fy, cx and cy of a calibration (--fy, --cx, --cy).",
+    ),
     "camera.zoom": MessageKind(
         "The photograph was zoomed digitally",
         cause="Some cameras do not count a digital zoom in the focal length of their EXIF.",

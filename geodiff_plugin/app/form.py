@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import gradio as gr
 
-from geodiff_plugin._checks import bad_value
-from geodiff_plugin.app.job import CAMERA_WAYS, LIMITS, Priors, options_of
-from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
+from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin.app.job import CAMERA_WAYS, LIMITS, Priors, options_of, photograph_size
+from geodiff_plugin.app.look import for_visitors
+from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, REAL_PAIRS_FOLDER
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.options import PRESETS, help_of
 
-PICTURE_HEIGHT = 190
+PICTURE_HEIGHT = 130
+EXAMPLES_HEIGHT = 120
 #: Of handlers that only the page itself calls.
 QUICK: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
 #: Of taps that come at once every one counts, after the one before.
@@ -32,12 +36,30 @@ NUMBERS = {
     "far": "Farthest depth, m",
 }
 PAIRS_FOLDER = Path(__file__).resolve().parent / "pairs"
-#: Folder, ending of its images -> what the page calls it; ``tests.scenes.make_examples`` renders them anew.
-EXAMPLES = {
-    (DEMO_PAIR_FOLDER, "png"): "A room, 12 cm apart",
-    (PAIRS_FOLDER / "table", "jpg"): "A table, 6 cm apart",
-    (PAIRS_FOLDER / "street", "jpg"): "A street, 50 cm apart",
-}
+
+
+@dataclass(frozen=True)
+class Example:
+    """A pair to try the page with: its folder, how its images end, and what the page calls it."""
+
+    folder: Path
+    ending: str
+    label: str
+
+    @property
+    def left(self) -> Path:
+        """The left image."""
+        return self.folder / f"left.{self.ending}"
+
+
+#: Real pairs first; ``tests.scenes.make_examples`` renders the others anew.
+EXAMPLES = (
+    Example(REAL_PAIRS_FOLDER / "toy", "png", "Playroom"),
+    Example(REAL_PAIRS_FOLDER / "cycles", "png", "Hallway"),
+    Example(REAL_PAIRS_FOLDER / "donkey_toy", "png", "Bedroom"),
+    Example(DEMO_PAIR_FOLDER, "png", "Desk, rendered"),
+    Example(PAIRS_FOLDER / "street", "jpg", "Street, rendered"),
+)
 
 
 @dataclass(frozen=True)
@@ -46,7 +68,6 @@ class Form:
 
     fields: dict[str, Any]
     untouched: dict[str, Any]
-    examples: gr.Gallery
     run: gr.Button
     stop: gr.Button
 
@@ -63,7 +84,7 @@ class Form:
 
     def example(self, number: int) -> list[Any]:
         """A value for every field: the files of an example, and all others as they began."""
-        folder, ending = list(EXAMPLES)[number]
+        folder, ending = EXAMPLES[number].folder, EXAMPLES[number].ending
         files: dict[str, Any] = {side: str(folder / f"{side}.{ending}") for side in ("left", "right")}
         files["calib"] = [str(folder / "calib.txt")]
         return list((self.untouched | files).values())
@@ -85,16 +106,31 @@ def _optional(name: str, placeholder: str, **more: Any) -> gr.Textbox:
     )
 
 
+def _path_of(payload: Any) -> str | None:
+    """The path of what was dropped, which nothing opens before us."""
+    return None if payload is None else payload.path
+
+
 def photograph_field(label: str, name: str) -> gr.Image:
     """A field for one photograph, whose value is the path of the file that was dropped, unchanged."""
-    return gr.Image(
-        label=label,
-        type="filepath",
-        image_mode=None,  # the file as it is: gradio's own conversion clips 16 bits and drops EXIF
-        sources=["upload", "clipboard"],
-        height=PICTURE_HEIGHT,
-        elem_id=name,
+    image = gr.Image(
+        label=label, type="filepath", sources=["upload", "clipboard"], height=PICTURE_HEIGHT, elem_id=name
     )
+    # gradio's own opens the file, and says what is wrong with it in words of Pillow.
+    vars(image)["preprocess"] = _path_of
+    return image
+
+
+def _told(path: str | None, name: str) -> str:
+    """What a file that was dropped is, or what is wrong with it, as soon as it is there."""
+    if path is None:
+        return ""
+    try:
+        width, height = photograph_size(path, name)
+    except InputError as error:
+        return f'<div class="note bad" role="alert">{escape(for_visitors(str(error)))}</div>'
+    shows = "" if Path(path).suffix.lower() not in (".heic", ".heif") else "; browsers cannot show HEIC"
+    return f'<div class="note">{width} x {height} pixels{shows}</div>'
 
 
 def _views() -> dict[str, Any]:
@@ -102,13 +138,17 @@ def _views() -> dict[str, Any]:
     drawn: dict[str, Any] = {}
     with gr.Row():
         for name, label in (("left", "Left photograph"), ("right", "Right photograph")):
-            drawn[name] = photograph_field(label, name)
+            with gr.Column(min_width=130):
+                drawn[name] = photograph_field(label, name)
+                about = gr.HTML(elem_id=f"{name}-note")
+            told = partial(_told, name=f"the {label.lower()}")
+            drawn[name].change(told, drawn[name], about, **QUICK)
     ways = [(label, name) for name, label in CAMERA_WAYS.items()]
-    drawn["way"] = way = gr.Radio(ways, value="file", label="Where the cameras are", elem_id="way")
+    drawn["way"] = way = gr.Radio(ways, value="file", label="What you know of the cameras", elem_id="way")
     drawn["calib"] = calibration = gr.File(
-        label="Calibration file, or one per camera (MVSNet, ROS, COLMAP)",
+        label="Calibration file, or one per camera",
         file_count="multiple",
-        height=140,
+        height=112,
         elem_id="calibration",
     )
     with gr.Column(visible=False) as lens, gr.Row():
@@ -163,27 +203,28 @@ def _settings(priors: Priors) -> dict[str, Any]:
     return drawn
 
 
-def build_form(priors: Priors) -> Form:
-    """Draw the fields into the open gradio context."""
-    names = ", ".join(label.lower() for label in EXAMPLES.values())
-    gr.HTML(f'<div class="legend-caption">Try an example, rendered by this project: {names}.</div>')
-    pictures = [(f"{place / 'left'}.{end}", label.split(",")[0]) for (place, end), label in EXAMPLES.items()]
-    examples = gr.Gallery(
-        pictures,
+def build_examples() -> gr.Gallery:
+    """Draw the examples into the open gradio context."""
+    return gr.Gallery(
+        [(str(example.left), example.label) for example in EXAMPLES],
         label="Examples: one click runs one",
         show_label=False,
         columns=len(EXAMPLES),
         rows=1,
-        height=150,
+        height=EXAMPLES_HEIGHT,
         allow_preview=False,
         interactive=False,
         buttons=[],
         object_fit="cover",
         elem_id="examples",
     )
+
+
+def build_form(priors: Priors) -> Form:
+    """Draw the fields into the open gradio context."""
     drawn = _views() | _settings(priors)
     untouched = {name: component.value for name, component in drawn.items()}
-    with gr.Row():
-        run = gr.Button("Estimate depth", variant="primary", scale=3, elem_id="run")
-        stop = gr.Button("Stop", scale=1, elem_id="stop")
-    return Form(drawn, untouched, examples, run, stop)
+    with gr.Row(elem_id="actions"):
+        run = gr.Button("Estimate depth", variant="primary", scale=3, min_width=120, elem_id="run")
+        stop = gr.Button("Stop", scale=1, min_width=70, elem_id="stop")
+    return Form(drawn, untouched, run, stop)

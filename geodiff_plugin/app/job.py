@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from PIL import Image
 
-from geodiff_plugin._checks import bad_value, check_choice, check_number, refuse
+from geodiff_plugin._checks import InputError, bad_value, check_choice, check_number, refuse
+from geodiff_plugin.app.keeping import Stopped
 from geodiff_plugin.formats.files import upright_size
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.jobs.options import DepthOptions
@@ -34,12 +36,10 @@ CAMERA_WAYS = {
 }
 #: A coordinate of an end of the known length.
 ENDS = re.compile(r"-?\d+(?:\.\d+)?")
-#: A photograph of more is not decoded.
-MOST_MEGAPIXELS = 50
-
-
-class Stopped(Exception):
-    """The visitor asked to stop."""
+#: A photograph of more is not decoded: a run takes some 120 MB a megapixel.
+MOST_MEGAPIXELS = 16
+#: Folder of results below that of temporary files, the only one whose files the page hands out.
+RESULTS = "results"
 
 
 class Priors:
@@ -57,6 +57,25 @@ class Priors:
         return self._loaded[name]
 
 
+def photograph_size(path: str, name: str) -> tuple[int, int]:
+    """Width and height of a photograph as it is shown.
+
+    Raises:
+        InputError: no picture, one that cannot be read here, or one of more than ``MOST_MEGAPIXELS``.
+    """
+    try:
+        width, height = upright_size(path, name)
+    except InputError as error:
+        if isinstance(error.__context__, Image.DecompressionBombError):
+            refuse(f"{name} is far too large: at most {MOST_MEGAPIXELS} megapixels can be used here.")
+        raise
+    if width * height > MOST_MEGAPIXELS * 1_000_000:
+        expected = f"an image of at most {MOST_MEGAPIXELS} megapixels"
+        got = f"{width}x{height}, which is {width * height / 1e6:.0f} megapixels"
+        bad_value(name, expected, got, "Scale both photographs down, and the calibration with them.")
+    return width, height
+
+
 def options_of(
     left: str | None,
     right: str | None,
@@ -71,19 +90,15 @@ def options_of(
 ) -> DepthOptions:
     """The fields of a visitor as options of ``geodiff depth``; ``None`` is an empty field.
 
-    ``way`` is a key of ``CAMERA_WAYS``; fields of another are left out. In ``lens`` fy is fx, and cx and cy
-    the middle of the image, where they are empty. ``known_length`` is in metres, between the pixels ``ends``.
+    ``way`` is a key of ``CAMERA_WAYS``; fields of another are left out. ``known_length`` is in metres,
+    between the pixels ``ends``.
     """
-    paths, sizes = [], []
+    paths = []
     for name, path in (("the left photograph", left), ("the right photograph", right)):
         if path is None:
             refuse(f"{name} is missing: drop a picture into its field.")
-        width, height = upright_size(path, name)
-        if width * height > MOST_MEGAPIXELS * 1_000_000:
-            expected = f"an image of at most {MOST_MEGAPIXELS} megapixels"
-            bad_value(name, expected, f"{width}x{height}", "Scale it down first, and K with it.")
+        photograph_size(path, name)
         paths.append(Path(path))
-        sizes.append((width, height))
     given = {name: value for name, value in (lens or {}).items() if value is not None}
     if way == "file" and not calib:
         refuse("The calibration file is missing: choose one, or give focal length and baseline.")
@@ -94,8 +109,7 @@ def options_of(
     if way == "photographs":
         run["known_length"] = _length_of_photographs(baseline, known_length, ends)
     if way != "file" and "fx" in given:
-        middle = {c: (side - 1) / 2 for c, side in zip(("cx", "cy"), sizes[0], strict=True)}
-        run |= {"fy": given["fx"]} | middle | given
+        run |= given
     return DepthOptions(
         left=paths[0],
         right=paths[1],
@@ -126,6 +140,16 @@ def _length_of_photographs(
     return ",".join([*numbers, f"{known_length}"])
 
 
+def results_folder() -> Path:
+    """Where the folders of all results are."""
+    return Path(tempfile.gettempdir(), RESULTS)
+
+
+def _new_folder() -> Path:
+    results_folder().mkdir(parents=True, exist_ok=True)
+    return results_folder() / secrets.token_hex(16)
+
+
 def run_job(
     options: DepthOptions, priors: Priors, stop: threading.Event, report: Callable[[float, str], None]
 ) -> PairResult:
@@ -142,7 +166,7 @@ def run_job(
     for name, most in LIMITS.items():
         check_number(getattr(options, name) or 0, FIELD_NAMES.get(name, name), 0, most, integer=True)
     options.check(lambda field: FIELD_NAMES.get(field.name, field.name))
-    folder, log = OutFolder(Path(tempfile.gettempdir(), f"geodiff-{secrets.token_hex(8)}")), JobLog()
+    folder, log = OutFolder(_new_folder()), JobLog()
     with collected_warnings(silent), folder:  # the log has them
         stage(0.0, "Reading the photographs and cameras")
         # The page keeps what is dropped in folders of its own, so only the names say something.

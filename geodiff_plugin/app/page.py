@@ -2,50 +2,28 @@
 
 from __future__ import annotations
 
-import ctypes
 import filecmp
-import gc
 import re
 import sys
 import tempfile
 import threading
 import traceback
-from collections import defaultdict
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from pathlib import Path
-from shutil import rmtree
-from types import SimpleNamespace
 from typing import Any
 
 import gradio as gr
-import numpy as np
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.app import look, results
-from geodiff_plugin.app.form import EXAMPLES, QUICK, TAPS, Form, build_form
-from geodiff_plugin.app.job import Priors, Stopped, run_job
-from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.jobs.records import PairResult
-from geodiff_plugin.jobs.report import depth_summary
-from geodiff_plugin.messages import distinct
+from geodiff_plugin.app.form import EXAMPLES, QUICK, TAPS, Form, build_examples, build_form
+from geodiff_plugin.app.job import Priors, run_job
+from geodiff_plugin.app.keeping import FORGET_AFTER_S, Keeper, Session, Sessions, Stopped, Turns, forget
+from geodiff_plugin.app.shown import Pixels, Shown, load, shown_of
 
-#: A visitor's uploads, result and files are deleted after this long, and when the tab is closed.
-FORGET_AFTER_S = 600
-#: The cloud shows points that are at least this likely to be right.
-LEAST_CONFIDENCE = 0.5
-#: The cloud is first seen from these angles, in degrees: around it, and down from straight above.
-VIEW_ANGLES = (90, 75)
-#: It is seen from this distance, as a multiple of its depth, which shows the whole of it.
-VIEW_FROM = 1.05
-#: Title of the tab whose cloud is made when it is opened.
-CLOUD_TAB = "Point cloud"
-#: Title of the tab whose files are written when it is opened.
-FILES_TAB = "Downloads"
-#: Pixels, the same for pictures and cloud, so that nothing jumps from tab to tab.
-PANEL_HEIGHT = 560
-#: Background of the cloud, as red, green, blue and opacity: colours show best on near black.
-NIGHT = (0.09, 0.1, 0.12, 1.0)
+FILES_TAB = "Files"
+#: The result that the page opens with; ``python -m tests.browser.make_first_result`` makes it anew.
+FIRST_RESULT = Path(__file__).with_name("first.npz")
 THEME = gr.themes.Base(
     primary_hue="teal",
     neutral_hue="slate",
@@ -68,299 +46,299 @@ THEME = gr.themes.Base(
 )
 
 
-def _forget(job: PairResult | None) -> None:
-    """Delete a result's files, and what it has in memory: gradio keeps the states of closed tabs a while."""
-    if job is not None:
-        _delete([job.folder])
-        for name in ("inputs", "output"):
-            vars(job.run).pop(name, None)
-        gc.collect()
-        if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)):
-            trim(0)  # else glibc keeps freed memory, more of it after every job
+@dataclass(frozen=True)
+class Panels:
+    """The components that show a result; each takes HTML, but the last ones."""
+
+    status: gr.HTML
+    scene_data: gr.HTML
+    marks_data: gr.HTML
+    headline: gr.HTML
+    depth: gr.HTML
+    legend: gr.HTML
+    picture: gr.HTML
+    readings: gr.HTML
+    confidence: gr.HTML
+    files: gr.HTML
+    tabs: gr.Tabs
+    pick: gr.Button  # that the browser's script presses for a click on a picture
+    picked: gr.Textbox  # the pixel of that click
+    pixel: gr.Textbox
+    add: gr.Button
+    clear: gr.Button
+
+    def of_result(self) -> list[gr.HTML]:
+        """Those whose value is made of a result."""
+        return [each for f in fields(self) if isinstance(each := getattr(self, f.name), gr.HTML)]
 
 
-def _kept(job: PairResult, ended: threading.Event) -> PairResult:
-    """The job, unless its visitor stopped it or left during its last stage."""
-    if ended.is_set():
-        _forget(job)
-        raise Stopped
-    return job
+@dataclass(frozen=True)
+class Memory:
+    """What the server knows of one open tab between its clicks."""
+
+    secret: gr.State  # of the result that is shown; empty for the one made beforehand
+    pixels: gr.State  # that were chosen in it
 
 
-def _uploads(options: DepthOptions) -> set[Path]:
+@dataclass(frozen=True)
+class First:
+    """The result that was made beforehand, and the pixels that were measured in it."""
+
+    shown: Shown
+    pixels: Pixels
+
+
+def read_first_result() -> First:
+    """The result that the page opens with."""
+    example = EXAMPLES[0]
+    return First(*load(FIRST_RESULT, example.left, f"example {example.label}, computed beforehand"))
+
+
+def _uploads(paths: list[str | None]) -> set[Path]:
     """The folders of a visitor's uploads; gradio names them by content, so examples are everybody's."""
-    files = (*options.photographs().values(), *options.calib)
     temporary = Path(tempfile.gettempdir()).resolve()
-    examples = [path for folder, _ in EXAMPLES for path in folder.iterdir()]
-    given = [path for path in files if temporary in path.resolve().parents]
-    return {p.parent for p in given if not any(filecmp.cmp(p, each, shallow=False) for each in examples)}
-
-
-def _delete(folders: Iterable[Path]) -> None:
-    for folder in folders:
-        rmtree(folder, ignore_errors=True)
-
-
-def for_visitors(sentence: str) -> str:
-    """A sentence of the command line without the server's folders, and with fields for options."""
-    sentence = re.sub(r"(?<![\w.])/(?:[^\s/]+/)+", "", sentence)
-    sentence = re.sub(r" \([^()]*--[^()]*\)", "", sentence)
-    for side in ("left", "right"):
-        sentence = re.sub(rf"\b{side.upper()}\b", f"the {side} photograph", sentence)
-    return re.sub(r"--(\w)", r"\1", sentence)
+    examples = [path for example in EXAMPLES for path in example.folder.iterdir()]
+    given = [Path(path) for path in paths if path and temporary in Path(path).resolve().parents]
+    there = [path for path in given if path.is_file()]
+    return {p.parent for p in there if not any(filecmp.cmp(p, each, shallow=False) for each in examples)}
 
 
 def _sentence(error: Exception) -> str:
     """One for the visitor; a defect's traceback goes to the terminal."""
     if isinstance(error, InputError):
-        return for_visitors(str(error))
+        return look.for_visitors(str(error))
     traceback.print_exception(error, file=sys.stderr)
     return f"This is a defect, not your input: {type(error).__name__}."
 
 
-def _figures(job: PairResult) -> list[tuple[str, str]]:
-    """Numbers for the banner; of a result that is not trusted only what is there, not how good it is."""
-    visible, confidence = results.map_of(job, "visible"), results.map_of(job, "confidence")
-    depth = depth_summary(results.depth_of(job), visible)
-    seconds = (f"{sum(job.run.log.seconds.values()):.1f} s", "computing")
-    if not job.run.output.verdict.trusted:
-        return [(f"{depth['median_m']:.2f} m, unconfirmed", "median depth"), seconds]
-    figures = [
-        (f"{depth['min_m']:.2f} m to {depth['max_m']:.2f} m", "nearest and farthest"),
-        (f"{depth['median_m']:.2f} m", "median depth"),
-    ]
-    if visible is not None:
-        figures.append((f"{100 * visible.mean():.0f} %", "seen by both cameras"))
-    if confidence is not None:
-        figures.append((f"{100 * np.median(confidence):.0f} %", "median confidence"))
-    return [*figures, seconds]
-
-
-def _cameras(job: PairResult) -> str:
-    """The cameras as understood."""
-    (fx, _, cx), (_, fy, cy), _ = results.K_of(job)
-    x, y, z = apart = job.run.inputs.guidance.rigs[0].E[:3, 3]
-    ways = {"right": x, "left": -x, "below": y, "above": -y, "before": z, "behind": -z}
-    way, away = max(ways, key=lambda side: ways[side]), np.linalg.norm(apart)
-    lens = f"fx {fx:.1f}, fy {fy:.1f}, cx {cx:.1f}, cy {cy:.1f} px"
-    return f"Left camera: {lens}; the right one {away:.3g} m away, {way}."
-
-
-def _everything(panels: SimpleNamespace, job: PairResult, opened: str) -> dict[Any, Any]:
-    """Every panel's value for a new result; the cloud's only while its tab is open."""
-    verdict = job.run.output.verdict
-    of_verdict = verdict.message and verdict.message.code  # which only sums up the others
-    messages = distinct(verdict.reasons, job.run.log.warnings)
-    told = [(m.code, for_visitors(m)) for m in messages if m.code != of_verdict]
-    marked, words = results.measurement(job, [])
-    sure = results.picture(job, "confidence")
-    shown = {
-        panels.status: look.finished(verdict.status, _figures(job), told, _cameras(job)),
-        panels.measure_verdict: look.banner(verdict.status),
-        panels.files_verdict: look.banner(verdict.status),
-        panels.slider: (results.picture(job, "photograph"), results.picture(job, "depth")),
-        panels.depth_legend: results.legend_of_depth(results.depth_of(job)),
-        panels.picture: marked,
-        panels.readings: words,
-        panels.files: [str(path) for path in results.files_of(job)],
-        panels.confidence: sure,
-        panels.confidence_legend: "" if sure is None else results.legend_of_confidence(),
+def _measured(shown: Shown, pixels: Pixels) -> dict[str, str]:
+    """HTML of the panels that change with every point."""
+    found = results.measurement(shown, pixels)
+    return {
+        "marks_data": look.hidden(results.marks_data(found.readings)),
+        "headline": found.headline,
+        "picture": look.picture(results.data_url(found.picture), "Photograph with the measured points"),
+        "readings": found.words,
     }
-    if opened == CLOUD_TAB:
-        shown[panels.scene], shown[panels.points] = _scene(job)
-    return shown
 
 
-def _scene(job: PairResult) -> tuple[Any, str]:
-    """The view of the cloud of confident points from behind the cameras, and a line about it."""
-    path, depth_m = job.folder / results.SCENE, results.depth_of(job)
-    count = results.write_scene(path, job, LEAST_CONFIDENCE)
-    share, away = 100 * count / depth_m.size, VIEW_FROM * float(np.percentile(depth_m, 90))
-    view = gr.Model3D(str(path), camera_position=(*VIEW_ANGLES, away))
-    return view, f'<div class="legend-caption">{count:,} points, {share:.0f} % of the pixels</div>'
+def _drawn(shown: Shown, pixels: Pixels) -> dict[str, str]:
+    """HTML of every panel for a result."""
+    photograph, depth = (results.picture(shown, name) for name in ("photograph", "depth"))
+    assert photograph is not None and depth is not None
+    sure = results.picture(shown, "confidence")
+    confidence = "This preset gives no confidence."
+    if sure is not None:
+        confidence = look.picture(results.data_url(sure), "Map of confidence")
+        confidence += results.legend_of_confidence()
+    return {
+        "status": look.banner(shown),
+        "scene_data": look.hidden(results.scene_data(shown)),
+        "depth": look.compared(results.data_url(photograph), results.data_url(depth)),
+        "legend": results.legend_of_depth(shown.depth_m),
+        "confidence": confidence,
+        "files": look.files(results.files_of(shown, pixels)),
+        **_measured(shown, pixels),
+    }
 
 
-@dataclass
-class Session:
-    """One open tab: what ends its run, the folders of its uploads, and its last result."""
-
-    stop: threading.Event = field(default_factory=threading.Event)
-    uploads: set[Path] = field(default_factory=set)
-    result: PairResult | None = None
+def _nothing(status: str) -> dict[str, str]:
+    """HTML of the panels without a result, and why there is none."""
+    empty = dict.fromkeys(("scene_data", "marks_data", "depth", "legend", "picture", "confidence"), "")
+    empty |= {"headline": look.headline("", "No result yet."), "files": look.WAITING}
+    return empty | {"readings": look.HOW_TO_MEASURE, "status": status}
 
 
-class Sessions:
-    """The open tabs by gradio's name for them; a call over the API may have none."""
+@dataclass(frozen=True)
+class _Desk:
+    """What a run needs beside its fields; one for all visitors."""
 
-    def __init__(self) -> None:
-        self._of = defaultdict[str | None, Session](Session)
+    form: Form
+    panels: Panels
+    memory: Memory
+    priors: Priors
+    sessions: Sessions
+    turns: Turns
 
-    def of(self, request: gr.Request) -> Session:
-        """The session of a request."""
-        return self._of[request.session_hash]
+    def on_panels(self, html: dict[str, str]) -> dict[Any, Any]:
+        """Values of components by the names of panels."""
+        return {getattr(self.panels, name): value for name, value in html.items()}
 
-    def leave(self, request: gr.Request) -> None:
-        """End a session's run, and delete its result and the uploads that no other one has."""
-        session = self._of.pop(request.session_hash, Session())
-        session.stop.set()
-        _delete(session.uploads.difference(*(other.uploads for other in self._of.values())))
-        _forget(session.result)
+    def show(self, secret: str, shown: Shown) -> dict[Any, Any]:
+        """Everything on a new result."""
+        return {self.memory.secret: secret, self.memory.pixels: [], **self.on_panels(_drawn(shown, []))}
 
+    def show_nothing(self, status: str) -> dict[Any, Any]:
+        """Nothing, and why."""
+        return {self.memory.secret: "", self.memory.pixels: [], **self.on_panels(_nothing(status))}
 
-def _wire_run(
-    form: Form, panels: SimpleNamespace, state: gr.State, points: gr.State, tab: gr.State, priors: Priors
-) -> Callable[[gr.Request], Any]:
-    """Everything from the run to its result; what happens when a visitor leaves."""
-    fields, turn = list(form.fields.values()), threading.Lock()  # one job runs at a time
-    sessions = Sessions()
-    fixed = (panels.tabs, panels.pixel, panels.add, panels.clear)
-    shows = [component for component in vars(panels).values() if component not in fixed]
+    def run(self, session: Session, filled: tuple[Any, ...], progress: Any) -> Shown:
+        """The result of the fields as a visitor filled them in."""
+        wanted, stop = self.form.options(filled), session.stop
 
-    def come(request: gr.Request) -> str:
-        sessions.of(request).stop = threading.Event()
-        return look.BUSY
+        def wait(others: int) -> None:
+            runs = "1 run is" if others == 1 else f"{others} runs are"
+            progress(0.0, f"Waiting: {runs} before yours")
 
-    def stop(request: gr.Request) -> str:
-        sessions.of(request).stop.set()
-        return look.STOPPED
-
-    def nothing(status: str) -> dict[Any, Any]:
-        """No result, and why."""
-        empty = {each: "" if isinstance(each, gr.HTML) else None for each in shows}
-        return {**empty, panels.readings: look.HOW_TO_MEASURE, panels.status: status, state: None, points: []}
+        with self.turns.turn(session, wait):
+            shown = shown_of(run_job(wanted, self.priors, stop, progress))
+        if stop.is_set():  # the visitor stopped it, or left, during its last stage
+            forget(shown)
+            raise Stopped
+        return shown
 
     def estimate(
+        self,
         request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
         *values: Any,
     ) -> dict[Any, Any]:
         """Depth in metres of the left photograph, with its files."""
-        (*filled, before, opened), session = values, sessions.of(request)
+        session, keeper = self.sessions.of(request.session_hash), self.sessions.keeper
         try:
-            wanted, ended = form.options(tuple(filled)), session.stop
-            session.uploads |= _uploads(wanted)
-            with turn:
-                job = session.result = _kept(run_job(wanted, priors, ended, progress), ended)
-            return {state: job, points: [], **_everything(panels, job, opened)}
+            shown = self.run(session, values, progress)
+            keeper.drop(session.secret)
+            session.secret = keeper.add(shown)
+            return self.show(session.secret, shown)
         except Stopped:
-            return nothing(look.STOPPED)
+            return self.show_nothing(look.STOPPED)
         except Exception as error:  # whatever it is, the visitor reads a sentence
-            return nothing(look.failed(_sentence(error)))
+            return self.show_nothing(look.failed(_sentence(error)))
         finally:
             session.stop = threading.Event()
-            _forget(before)
+
+    def come(self, request: gr.Request) -> str:
+        """What is said at once when a run was asked for."""
+        self.sessions.of(request.session_hash)
+        return look.BUSY
+
+    def stop(self, request: gr.Request) -> str:
+        """End the visitor's run before its next step."""
+        self.sessions.of(request.session_hash).stop.set()
+        return look.STOPPED
+
+    def note_uploads(self, request: gr.Request, left: Any, right: Any, files: Any) -> None:
+        """Remember a visitor's uploads, to delete them when the visitor leaves."""
+        paths = [left, right, *(files or ())]
+        self.sessions.of(request.session_hash).uploads |= _uploads(paths)
+
+    def come_back(self, request: gr.Request, secret: str) -> dict[Any, Any]:
+        """The result that a tab had before it was reloaded, if it is still there."""
+        shown = self.sessions.keeper.get(secret)
+        if shown is None:
+            return {self.memory.secret: ""}
+        self.sessions.keeper.end_in(secret, FORGET_AFTER_S)
+        self.sessions.of(request.session_hash).secret = secret
+        return self.show(secret, shown)
+
+    def leave(self, request: gr.Request) -> None:
+        """End what a closed tab had."""
+        self.sessions.leave(request.session_hash)
+
+
+def _wire_run(desk: _Desk, examples: gr.Gallery) -> None:
+    """What happens from a click on an example or on the button to the result."""
+    form, panels, memory = desk.form, desk.panels, desk.memory
+    fields_of_form = list(form.fields.values())
 
     def take(event: gr.SelectData) -> list[Any]:
         return form.example(int(event.index))
 
-    chosen = form.examples.select(take, outputs=fields, **QUICK)
+    chosen = examples.select(take, outputs=fields_of_form, **QUICK)
     for name, begins in (("estimate", form.run.click), ("example", chosen.then)):
-        begins(come, outputs=panels.status, js=look.RUN_BEGINS, **QUICK).then(
-            estimate,
-            [*fields, state, tab],
-            [*shows, state, points],
-            concurrency_limit=1,
-            concurrency_id="job",
+        begins(desk.come, outputs=panels.status, js=look.RUN_BEGINS, **QUICK).then(
+            desk.estimate,
+            fields_of_form,
+            [*panels.of_result(), memory.secret, memory.pixels],
+            concurrency_limit=None,
             show_progress="full",
             show_progress_on=panels.status,
             api_name=name if name == "estimate" else False,
-        ).then(None, js=look.RUN_ENDS, queue=False)
-    form.stop.click(stop, outputs=panels.status, **QUICK)
-    files = [field for field in fields if hasattr(field, "upload")]
-    changes = [event for field in files for event in (field.upload, field.clear)]
+        ).then(None, memory.secret, js=look.RUN_ENDS, queue=False)
+    form.stop.click(desk.stop, outputs=panels.status, **QUICK)
+
+
+def _wire_form(desk: _Desk) -> None:
+    """What happens when files come, change or go."""
+    drops = [desk.form.fields[name] for name in ("left", "right", "calib")]
+    gr.on([field.upload for field in drops], desk.note_uploads, drops, None, **QUICK)
+    changes = [event for field in drops for event in (field.upload, field.clear)]
     gr.on(changes, None, js=look.CHANGED, queue=False)
-    return sessions.leave
 
 
-def _wire_panels(panels: SimpleNamespace, state: gr.State, points: gr.State, tab: gr.State) -> None:
-    def redraw(job: PairResult | None, pixels: results.Pixels) -> tuple[Any, ...]:
-        if job is None:
-            return gr.skip(), gr.skip(), gr.skip()
-        return pixels, *results.measurement(job, pixels)
+def _wire_measuring(desk: _Desk, first: First) -> None:
+    """What happens when points are chosen, in the 3D view, on the photograph or by their numbers."""
+    panels, memory, keeper = desk.panels, desk.memory, desk.sessions.keeper
 
-    def click(job: PairResult | None, pixels: results.Pixels, event: gr.SelectData) -> tuple[Any, ...]:
-        return redraw(job, [*pixels, tuple(event.index)][-len(results.NAMES) :])
+    def shown_by(secret: str) -> Shown | None:
+        return keeper.get(secret) if secret else first.shown
 
-    def add(job: PairResult | None, pixels: results.Pixels, typed: str) -> tuple[Any, ...]:
-        numbers = [int(word) for word in re.findall(r"\d{1,6}", typed or "")]
-        if job is None or len(numbers) != 2:
-            return gr.skip(), gr.skip(), "Type two whole numbers: x, y." if job else gr.skip()
-        x, y = (round(number * results.scale_of(job)) for number in numbers)
-        return redraw(job, [*pixels, (x, y)][-len(results.NAMES) :])
+    def redraw(secret: str, pixels: Pixels) -> dict[Any, Any]:
+        shown = shown_by(secret)
+        if shown is None:
+            return {panels.readings: look.failed("This result is no longer here. Estimate again.")}
+        return {memory.pixels: pixels, **desk.on_panels(_measured(shown, pixels))}
 
-    def turn(job: PairResult | None, pixels: results.Pixels, event: gr.SelectData) -> dict[Any, Any]:
-        """What is made when its tab is opened."""
-        shown: dict[Any, Any] = {tab: event.value}
-        if job is not None and event.value == CLOUD_TAB:
-            # A 3D view that gets its file while it is hidden stays empty (gradio 6.31).
-            shown[panels.scene], shown[panels.points] = _scene(job)
-        elif job is not None and event.value == FILES_TAB:  # with what was measured
-            shown[panels.files] = [str(path) for path in results.files_of(job, pixels)]
-        return shown
+    def add(secret: str, pixels: Pixels, typed: str) -> dict[Any, Any]:
+        numbers = [int(word) for word in re.findall(r"\d{1,13}", typed or "")]
+        if len(numbers) < 2:
+            return {panels.readings: "Type two whole numbers: x, y."}
+        try:
+            return redraw(secret, [*pixels, (numbers[0], numbers[1])][-len(results.NAMES) :])
+        except InputError as error:
+            return {panels.readings: look.failed(_sentence(error))}
 
-    measured = [points, panels.picture, panels.readings]
-    panels.picture.select(click, [state, points], measured, **TAPS)
-    gr.on([panels.add.click, panels.pixel.submit], add, [state, points, panels.pixel], measured, **QUICK)
-    panels.clear.click(lambda job: redraw(job, []), state, measured, **QUICK)
-    shows = [tab, panels.scene, panels.points, panels.files]
-    panels.tabs.select(turn, [state, points], shows, **QUICK)
+    def turn(secret: str, pixels: Pixels, event: gr.SelectData) -> Any:
+        """Files with what was measured, made when their tab is opened."""
+        shown = shown_by(secret)
+        if shown is None or event.value != FILES_TAB:
+            return gr.skip()
+        return look.files(results.files_of(shown, pixels))
 
-
-def _image(label: str, **more: Any) -> gr.Image:
-    return gr.Image(
-        label=label, show_label=False, interactive=False, format="png", buttons=["fullscreen"], **more
-    )
+    measured = [memory.pixels, panels.marks_data, panels.headline, panels.picture, panels.readings]
+    picked = [memory.secret, memory.pixels, panels.picked]
+    panels.pick.click(add, picked, measured, js=look.PICKED, **TAPS)
+    typed = [panels.add.click, panels.pixel.submit]
+    gr.on(typed, add, [memory.secret, memory.pixels, panels.pixel], measured, **QUICK)
+    panels.clear.click(lambda secret: redraw(secret, []), memory.secret, measured, **QUICK)
+    panels.tabs.select(turn, [memory.secret, memory.pixels], panels.files, **QUICK)
 
 
-def _build_panels() -> SimpleNamespace:
+def _build_panels(html: dict[str, str]) -> Panels:
     """Draw the result side of the page, tab by tab, into the open gradio context."""
-    panels = SimpleNamespace(status=gr.HTML(look.WAITING, elem_id="status"))
-    with gr.Tabs() as panels.tabs:
+    drawn: dict[str, Any] = {"status": gr.HTML(html["status"], elem_id="status")}
+    for name, place in (("scene_data", "scene-data"), ("marks_data", "marks-data")):
+        drawn[name] = gr.HTML(html[name], elem_id=place)
+    drawn["pick"] = gr.Button(visible="hidden", elem_id="pick")
+    drawn["picked"] = gr.Textbox(visible="hidden", elem_id="picked")
+    with gr.Tabs() as drawn["tabs"]:
+        with gr.Tab("3D"):
+            drawn["headline"] = gr.HTML(html["headline"], elem_id="headline")
+            gr.HTML(look.VIEWER, elem_id="scene")
         with gr.Tab("Depth"):
-            panels.slider = gr.ImageSlider(
-                label="Drag: photograph | metric depth",
-                show_label=False,
-                interactive=False,
-                format="png",
-                max_height=PANEL_HEIGHT,
-                buttons=["fullscreen"],
-                elem_id="slider",
-            )
-            panels.depth_legend = gr.HTML(elem_id="depth-legend")
-        with gr.Tab("Measure"):
-            panels.measure_verdict = gr.HTML()
-            with gr.Row():
-                with gr.Column(scale=5, min_width=300):
-                    panels.picture = _image("Click points", elem_id="measure-picture")
-                with gr.Column(scale=3, min_width=260):
-                    panels.readings = gr.HTML(look.HOW_TO_MEASURE, elem_id="readings")
-                    label = "A point by its pixel: x, y"
-                    panels.pixel = gr.Textbox(
-                        label=label, placeholder="320, 240", max_lines=1, elem_id="pixel"
-                    )
-                    with gr.Row():
-                        panels.add = gr.Button("Add point", size="sm", elem_id="add-point")
-                        panels.clear = gr.Button("Clear points", size="sm")
-        with gr.Tab(CLOUD_TAB):
-            panels.scene = gr.Model3D(
-                label="Drag to turn, scroll to come nearer",
-                interactive=False,
-                clear_color=NIGHT,
-                height=PANEL_HEIGHT,
-                elem_id="scene",
-            )
-            panels.points = gr.HTML(elem_id="points")
-        with gr.Tab("How sure"):
-            panels.confidence, panels.confidence_legend = _image("Confidence"), gr.HTML()
+            drawn["depth"] = gr.HTML(html["depth"], elem_id="depth")
+            drawn["legend"] = gr.HTML(html["legend"], elem_id="depth-legend")
+        with gr.Tab("Measure"), gr.Row():
+            with gr.Column(scale=5, min_width=280):
+                drawn["picture"] = gr.HTML(html["picture"], elem_id="measure-picture")
+            with gr.Column(scale=3, min_width=240):
+                drawn["readings"] = gr.HTML(html["readings"], elem_id="readings")
+                drawn["pixel"] = gr.Textbox(
+                    label="A point by its pixel: x, y", placeholder="320, 240", max_lines=1, elem_id="pixel"
+                )
+                with gr.Row():
+                    drawn["add"] = gr.Button("Add point", size="sm", elem_id="add-point")
+                    drawn["clear"] = gr.Button("Clear points", size="sm")
+        with gr.Tab("Confidence"):
+            drawn["confidence"] = gr.HTML(html["confidence"], elem_id="confidence")
         with gr.Tab(FILES_TAB):
-            panels.files_verdict = gr.HTML()
-            label = "All in one, depth, cloud and report"
-            panels.files = gr.File(label=label, interactive=False, elem_id="files")
-    return panels
+            drawn["files"] = gr.HTML(html["files"], elem_id="files")
+    return Panels(**drawn)
 
 
 def build_page(priors: Priors) -> gr.Blocks:
     """The whole page with what a visitor may choose; launch it with ``theme=THEME, css=look.CSS``."""
+    first, sessions = read_first_result(), Sessions(Keeper())
     with gr.Blocks(
         title="Depth in metres from two photographs",
         analytics_enabled=False,
@@ -368,16 +346,20 @@ def build_page(priors: Priors) -> gr.Blocks:
         fill_width=True,
     ) as page:
         gr.HTML(look.HEADER)
-        state = gr.State(None, time_to_live=FORGET_AFTER_S, delete_callback=_forget)
-        points, tab = gr.State([]), gr.State("")
-        with gr.Row(equal_height=False):
-            with gr.Column(scale=5, min_width=340, elem_id="form"):
+        memory = Memory(gr.State(""), gr.State(first.pixels))
+        secret = gr.Textbox(visible="hidden")
+        with gr.Row(equal_height=False, elem_id="main"):
+            with gr.Column(elem_id="examples-part"):
+                examples = build_examples()
+            with gr.Column(elem_id="results"):
+                panels = _build_panels(_drawn(first.shown, first.pixels))
+            with gr.Column(elem_id="form"):
                 form = build_form(priors)
-            with gr.Column(scale=8, min_width=340, elem_id="results"):
-                panels = _build_panels()
-        leave = _wire_run(form, panels, state, points, tab, priors)
-        _wire_panels(panels, state, points, tab)
-
-        page.load(None, js=look.WATCH_FORM)
-        page.unload(leave)
+        desk = _Desk(form, panels, memory, priors, sessions, Turns())
+        _wire_run(desk, examples)
+        _wire_form(desk)
+        _wire_measuring(desk, first)
+        shows = [*panels.of_result(), memory.secret, memory.pixels]
+        page.load(desk.come_back, secret, shows, js=look.COME_BACK, **QUICK)
+        page.unload(desk.leave)
     return page

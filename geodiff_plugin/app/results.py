@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
+import zlib
+from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from statistics import NormalDist
 from zipfile import ZIP_STORED, ZipFile
@@ -15,25 +19,23 @@ from PIL import Image, ImageDraw, ImageFont
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.app import look
-from geodiff_plugin.formats import make_cloud, write_glb
+from geodiff_plugin.app.shown import Pixels, Shown, kept_in_view
+from geodiff_plugin.formats.clouds import CAMERA_COLOURS, EDGES, PYRAMID_SHARE, camera_pyramid
 from geodiff_plugin.formats.out import REPORT
-from geodiff_plugin.jobs.records import PairResult
-from geodiff_plugin.jobs.report import single_map
-from geodiff_plugin.jobs.writing import cameras_of, pixels_of
-from geodiff_plugin.plotting import as_picture, colour_depth, colour_share, depth_range, ticks
+from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, ticks
 
 #: Pictures on the page are no larger than this; files to take home have every pixel.
 LARGEST_SIDE = 1600
 #: More points than this make a browser slow; the files to take home hold all.
-MOST_POINTS_SHOWN = 250_000
+MOST_POINTS_SHOWN = 160_000
+LARGEST_16_BITS = 65535
+JPEG_QUALITY = 88
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 LEGEND_STOPS = 24
 #: Name of the archive of all files.
 EVERYTHING = "everything.zip"
 #: Name of the table of what the visitor measured.
 MEASUREMENTS = "measurements.csv"
-#: Name of the cloud that the page shows.
-SCENE = "scene.glb"
 MARK = "#c2410c"
 #: ``confidence`` is the probability that a depth is within this share of the truth.
 CONFIDENT_WITHIN = 0.1
@@ -43,7 +45,6 @@ LEAST_CONFIDENCE = 0.05
 MOST_CONFIDENCE = 0.999
 #: From the median absolute deviation to the standard deviation of a normal distribution.
 SD_OF_MAD = 1.4826
-Pixels = list[tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -122,50 +123,76 @@ def metres(value: float, spread: float | None = None) -> str:
     return f"{value:.{decimals}f}{'' if spread is None else f' ± {spread:.{decimals}f}'} m"
 
 
-def map_of(job: PairResult, name: str) -> np.ndarray | None:
-    """``(H, W)`` of a map of the output, or ``None``."""
-    value = getattr(job.run.output, name)
-    return None if value is None else single_map(value)
-
-
-def depth_of(job: PairResult) -> np.ndarray:
-    """``(H, W)`` float32 metres."""
-    return single_map(job.run.output.prediction).astype(np.float32)
-
-
-def K_of(job: PairResult) -> np.ndarray:
-    """``(3, 3)`` pixels of the maps."""
-    return np.asarray(job.run.output.K)[0].astype(np.float64)
-
-
-def scale_of(job: PairResult) -> float:
+def scale_of(shown: Shown) -> float:
     """Size of the pictures on the page / size of the maps."""
-    return min(1.0, LARGEST_SIDE / max(job.run.inputs.left.shape))
+    return min(1.0, LARGEST_SIDE / max(shown.depth_m.shape))
 
 
-def picture(job: PairResult, name: str) -> np.ndarray | None:
+def picture(shown: Shown, name: str) -> np.ndarray | None:
     """``(h, w, 3)`` uint8 of ``photograph``, ``depth`` or ``confidence``; ``None`` without such a map."""
     if name == "photograph":
-        full = np.asarray(as_picture(job.run.inputs.left))
+        full = shown.photograph
     elif name == "depth":
-        full = colour_depth(depth_of(job))
+        full = colour_depth(shown.depth_m)
+    elif shown.confidence is None:
+        return None
     else:
-        confidence = map_of(job, "confidence")
-        if confidence is None:
-            return None
-        full = colour_share(confidence)
-    if (scale := scale_of(job)) == 1:
+        full = colour_share(shown.confidence)
+    if (scale := scale_of(shown)) == 1:
         return full
     size = (round(full.shape[1] * scale), round(full.shape[0] * scale))
     return np.asarray(Image.fromarray(full).resize(size, Image.Resampling.LANCZOS))
 
 
-def reading(job: PairResult, pixel: tuple[int, int]) -> Reading:
-    """What the map says at a pixel of a picture on the page."""
-    depth_m = depth_of(job)
-    most = np.array(depth_m.shape[::-1]) - 1
-    x, y = np.rint((np.array(pixel) + 0.5) / scale_of(job) - 0.5).astype(int).clip(0, most)
-    return read_pixel(depth_m, K_of(job), (x, y), map_of(job, "confidence"), map_of(job, "uncertainty"))
+def data_url(pixels: np.ndarray) -> str:
+    """A picture ``(h, w, 3)`` uint8 as the address of itself: no copy of it lies at the server."""
+    buffer = BytesIO()
+    Image.fromarray(pixels).save(buffer, "JPEG", quality=JPEG_QUALITY)
+    return f"data:image/jpeg;base64,{b64encode(buffer.getvalue()).decode()}"
+
+
+def reading(shown: Shown, pixel: tuple[int, int]) -> Reading:
+    """What the maps say at a pixel ``(x, y)``; one outside of them counts as the nearest inside."""
+    height, width = shown.depth_m.shape
+    x, y = (min(max(number, 0), side - 1) for number, side in zip(pixel, (width, height), strict=True))
+    return read_pixel(shown.depth_m, shown.K, (x, y), shown.confidence, shown.uncertainty_m)
+
+
+def scene_data(shown: Shown) -> str:
+    """What ``viewer.js`` draws, as JSON: a thinned grid of depth and confidence, photograph and cameras."""
+    height, width = shown.depth_m.shape
+    stride = max(1, math.ceil(math.sqrt(height * width / MOST_POINTS_SHOWN)))
+    z = np.where(kept_in_view(shown), shown.depth_m, 0)[::stride, ::stride]
+    sure = np.ones_like(z) if shown.confidence is None else shown.confidence[::stride, ::stride]
+    unit = max(float(z.max()) / LARGEST_16_BITS, 1e-6)
+    maps = np.rint(z / unit).astype("<u2").tobytes() + np.rint(sure * 255).astype(np.uint8).tobytes()
+    photograph = picture(shown, "photograph")
+    assert photograph is not None
+    length_m = PYRAMID_SHARE * float(np.median(z[z > 0])) if (z > 0).any() else 1.0
+    cameras = []
+    for number, view in enumerate(shown.views):
+        corners = camera_pyramid(view.K, view.E, view.size, length_m)
+        edges = (corners[EDGES] * (1.0, -1.0, -1.0)).reshape(-1, 3)
+        colour = [value / 255 for value in CAMERA_COLOURS[number % len(CAMERA_COLOURS)]]
+        cameras.append({"edges": edges.round(4).tolist(), "colour": colour})
+    lens = {"fx": shown.K[0, 0], "fy": shown.K[1, 1], "cx": shown.K[0, 2], "cy": shown.K[1, 2]}
+    size = {"width": width, "height": height, "w": z.shape[1], "h": z.shape[0], "stride": stride}
+    encoded = b64encode(zlib.compress(maps, 9)).decode()
+    drawn = {"maps": encoded, "unit": unit, "photograph": data_url(photograph), "cameras": cameras}
+    return json.dumps(size | lens | drawn)
+
+
+def marks_data(readings: Sequence[Reading]) -> str:
+    """The measured points and their distances as JSON, for ``viewer.js``."""
+    points = [
+        {"name": name, "at": [round(float(value), 4) for value in each.point_m]}
+        for name, each in zip(NAMES, readings, strict=False)
+    ]
+    segments = [
+        {"ends": [2 * number, 2 * number + 1], "text": metres(*distance_m(*pair))}
+        for number, pair in enumerate(zip(readings[::2], readings[1::2], strict=False))
+    ]
+    return json.dumps({"points": points, "segments": segments})
 
 
 def _legend(colours: np.ndarray, marks: Sequence[tuple[float, str]], caption: str) -> str:
@@ -195,11 +222,33 @@ def legend_of_confidence() -> str:
     return _legend(colours, marks, "Confidence: probability that a depth is within 10 % of the truth")
 
 
-def measurement(job: PairResult, pixels: Pixels) -> tuple[np.ndarray, str]:
-    """The photograph with the points of these pixels, and what they say as HTML; every two are a segment."""
-    readings, photograph = [reading(job, pixel) for pixel in pixels], picture(job, "photograph")
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """Points that were chosen: their readings, the photograph with them, and what they say as HTML."""
+
+    readings: list[Reading]
+    picture: np.ndarray
+    words: str
+    headline: str  # the last distance, for the 3D view
+
+
+def measurement(shown: Shown, pixels: Pixels) -> Measurement:
+    """What the maps say at these pixels; every two are a segment."""
+    readings, photograph = [reading(shown, pixel) for pixel in pixels], picture(shown, "photograph")
     assert photograph is not None
-    return marked(photograph, pixels, readings), _words(readings) if readings else look.HOW_TO_MEASURE
+    scale = scale_of(shown)
+    places = [(round(x * scale), round(y * scale)) for x, y in pixels]
+    words = _words(readings) if readings else look.HOW_TO_MEASURE
+    return Measurement(readings, marked(photograph, places, readings), words, _headline(shown, readings))
+
+
+def _headline(shown: Shown, readings: list[Reading]) -> str:
+    if len(readings) % 2:
+        return look.headline(metres(readings[-1].depth_m, readings[-1].spread_m), look.SECOND_POINT)
+    if not readings:
+        return look.headline("", look.CLICK_TWO)
+    hint = look.CLICK_OR_BRING if shown.title else look.CLICK_TWO
+    return look.headline(metres(*distance_m(readings[-2], readings[-1])), hint)
 
 
 def marked(photograph: np.ndarray, pixels: Pixels, readings: Sequence[Reading]) -> np.ndarray:
@@ -261,26 +310,17 @@ def _write_readings(path: Path, readings: Sequence[Reading]) -> None:
             writer.writerow((f"{a} to {b}", *[""] * 5, spread, "", f"{length:.4f}"))
 
 
-def write_scene(path: Path, job: PairResult, least_confidence: float) -> int:
-    """Cloud and cameras as GLB, light enough for a browser; how many points there are in all."""
-    cloud = make_cloud(*pixels_of(job.run.output, job.run.inputs.left, least_confidence))
-    write_glb(path, cloud.thinned(MOST_POINTS_SHOWN), cameras_of(job.run.output, job.run.inputs.guidance))
-    return len(cloud.points_m)
-
-
-def files_of(job: PairResult, pixels: Sequence[tuple[int, int]] = ()) -> list[Path]:
+def files_of(shown: Shown, pixels: Sequence[tuple[int, int]] = ()) -> list[Path]:
     """Everything that can be downloaded, first all in one, with ``measurements.csv`` of these pixels."""
-    folder = job.folder
+    folder = shown.folder
+    if folder is None:
+        return []
     if pixels:
-        _write_readings(folder / MEASUREMENTS, [reading(job, pixel) for pixel in pixels])
+        _write_readings(folder / MEASUREMENTS, [reading(shown, pixel) for pixel in pixels])
     else:
         (folder / MEASUREMENTS).unlink(missing_ok=True)
-    report = (folder / REPORT).read_text(encoding="utf-8")
-    for path in (*job.run.options.photographs().values(), *job.run.options.calib):
-        report = report.replace(str(path), path.name)
-    (folder / REPORT).write_text(report, encoding="utf-8")
     wanted = f"depth_mm.png depth.npy depth.png confidence.npy cloud.ply cloud.glb mesh.glb {REPORT}".split()
-    others = sorted({path.name for path in folder.iterdir()} - {*wanted, EVERYTHING, SCENE})
+    others = sorted({path.name for path in folder.iterdir()} - {*wanted, EVERYTHING})
     paths = [folder / name for name in (*wanted, *others) if (folder / name).is_file()]
     with ZipFile(folder / EVERYTHING, "w", ZIP_STORED) as archive:
         for path in paths:

@@ -191,7 +191,7 @@ def write_vertices(
             file.write(np.rec.fromarrays(columns, dtype=vertex).tobytes())
 
 
-def _pyramid(K: np.ndarray, E: np.ndarray, size: tuple[int, int], length_m: float) -> np.ndarray:
+def camera_pyramid(K: np.ndarray, E: np.ndarray, size: tuple[int, int], length_m: float) -> np.ndarray:
     """``(5, 3)`` centre and corners of a camera's view at ``length_m``, in the left camera's frame."""
     right, bottom = (side - 0.5 for side in size)
     corners = [(-0.5, -0.5), (right, -0.5), (right, bottom), (-0.5, bottom)]
@@ -223,7 +223,7 @@ def write_glb(
         length_m = PYRAMID_SHARE * float(np.median(geometry.vertices[:, 2]))
         scene.add_geometry(geometry, geom_name=name)
     for number, (K, E, size) in enumerate(cameras):
-        lines = trimesh.load_path(_pyramid(np.asarray(K), np.asarray(E), size, length_m)[EDGES])
+        lines = trimesh.load_path(camera_pyramid(np.asarray(K), np.asarray(E), size, length_m)[EDGES])
         lines.colors = np.tile(CAMERA_COLOURS[number % len(CAMERA_COLOURS)], (len(lines.entities), 1))
         scene.add_geometry(lines, geom_name=f"camera {number}")
     for geometry in scene.geometry.values():

@@ -68,7 +68,7 @@ def open_image(path: PathLike, name: str, what: str = "an image file") -> Iterat
         try:
             import pillow_heif
         except ImportError:
-            cure = "Run: pip install pillow-heif, or convert it to PNG or JPEG."
+            cure = "Run: pip install pillow-heif (the extra heic), or convert it to PNG or JPEG."
             bad_value(name, what, f"{file}, which Pillow reads with pillow-heif only", cure)
         pillow_heif.register_heif_opener()
     try:

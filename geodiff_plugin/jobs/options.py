@@ -33,6 +33,8 @@ from geodiff_plugin.options import (
 MODEL_FILES = ("cameras.txt", "images.txt")
 _camera, _output = partial(declare, panel=CAMERAS), partial(declare, panel=OUTPUT)
 PARAMETERS = ("fx", "fy", "cx", "cy", "baseline")
+#: Those that nothing stands in for.
+NEEDED_PARAMETERS = ("fx", "baseline")
 #: The ways to give cameras, by the options that belong to each alone.
 WAYS = {
     "file": ("calib",),
@@ -92,9 +94,9 @@ class DepthOptions(SpeedOptions, RunOptions):
     )
     cameras: str | None = _camera(None, "Two cameras of a calibration file that has more, left first: 2,3.")
     fx: float | None = _camera(None, "Focal length along x in pixels.")
-    fy: float | None = _camera(None, "Focal length along y in pixels.")
-    cx: float | None = _camera(None, "Principal point in pixels from the left edge.")
-    cy: float | None = _camera(None, "Principal point in pixels from the top edge.")
+    fy: float | None = _camera(None, "Focal length along y in pixels (default: --fx).")
+    cx: float | None = _camera(None, "Principal point in pixels from the left edge (default: the middle).")
+    cy: float | None = _camera(None, "Principal point in pixels from the top edge (default: the middle).")
     baseline: float | None = _camera(
         None, "Distance between the cameras in metres; replaces that of --calib.", above_0="metres"
     )
@@ -326,7 +328,7 @@ class DepthOptions(SpeedOptions, RunOptions):
         alone = self.right is None and self.disparity is None
         # --baseline beside --calib gives a file its unit, as COLMAP's models need it.
         needed = {
-            "parameters": PARAMETERS[: 4 if self.calib or self.estimate_pose or alone else 5],
+            "parameters": NEEDED_PARAMETERS[: 1 if self.calib or self.estimate_pose or alone else 2],
             "matrices": ("k",) if self.estimate_pose or alone else ("k", "e"),
         }
         every = itertools.chain(PARAMETERS, *WAYS.values())
@@ -347,6 +349,8 @@ class DepthOptions(SpeedOptions, RunOptions):
             names = dict.fromkeys((*needed[way], *WAYS[way]))
             there = " ".join(_flag(name) for name in names if name in given)
             refuse(f"With {there} give {' '.join(missing)} as well.")
+        if self.cropped and way == "parameters" and None in (self.cx, self.cy):
+            refuse("With --cropped give --cx --cy as well: the middle of a crop is not that of the camera.")
         if self.estimate_pose and self.cropped and way in ("--fov", "EXIF") and not self.view_k:
             why = f"{way} does not tell where the principal point of a crop is"
             refuse(f"--cropped needs --K, or --fx --fy --cx --cy: {why}.")

@@ -38,7 +38,7 @@ from geodiff_plugin.formats.lenses import (
 from geodiff_plugin.formats.reading import is_as_stored
 from geodiff_plugin.formats.recordings import both_halves
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
-from geodiff_plugin.jobs.options import PARAMETERS, DepthOptions, unique_names
+from geodiff_plugin.jobs.options import DepthOptions, unique_names
 from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Distortion, Rig
 
@@ -154,7 +154,35 @@ def _posed_guidance(
     right_given = options.k_right is not None or options.cx_right is not None
     if options.cameras_way() in ("parameters", "matrices") and not right_given:
         assume_same_centre(guidance)
+    guidance.assumed = [*guidance.assumed, *_filled_in(options)]
     return guidance
+
+
+def _lens_of(options: DepthOptions, size: Size) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy as given; fy is fx, and the principal point the middle of the image, where not."""
+    assert options.fx is not None
+
+    def or_else(given: float | None, stand_in: float) -> float:
+        return stand_in if given is None else given
+
+    middle_x, middle_y = ((side - 1) / 2 for side in size)
+    fy, cx, cy = or_else(options.fy, options.fx), or_else(options.cx, middle_x), or_else(options.cy, middle_y)
+    return options.fx, fy, cx, cy
+
+
+def _filled_in(options: DepthOptions) -> tuple[Message, ...]:
+    """What stands in for numbers of ``--fx`` and its like that were left out."""
+    if options.fx is None:
+        return ()
+    said = ["fy is assumed to be fx"] if options.fy is None else []
+    missing = [name for name in ("cx", "cy") if getattr(options, name) is None]
+    if missing:
+        verb = "is" if len(missing) == 1 else "are"
+        said.append(f"{' and '.join(missing)} {verb} assumed to be the middle of the image")
+    if not said:
+        return ()
+    typed = ", ".join(f"--{name}" for name in ("fy", "cx", "cy") if getattr(options, name) is None)
+    return (Message("camera.filled-in", f"{'; '.join(said)}. Give the calibrated numbers ({typed})."),)
 
 
 def _read_both(options: DepthOptions, as_stored: bool) -> list[np.ndarray]:
@@ -195,9 +223,8 @@ def read_rig(
         of: dict[str, Any] = {"image_names": names, "image_size": left_size, "baseline_m": options.baseline}
         rig = read_calibration(options.calib, options.camera_pair(), str(options.left), distorted=True, **of)
     elif way == "parameters":
-        camera = [getattr(options, name) for name in PARAMETERS[:-1]]
         baseline_m = 1.0 if options.baseline is None else options.baseline
-        rig = rig_from_parameters(*camera, baseline_m, cx_right=options.cx_right)
+        rig = rig_from_parameters(*_lens_of(options, left_size), baseline_m, cx_right=options.cx_right)
         rig = replace(rig, E=np.eye(4)) if options.baseline is None else rig
     else:
         assert options.k is not None
@@ -228,7 +255,8 @@ def _intrinsics(
     if options.k is not None:
         return _matrix(options.k, "--K")
     if way == "parameters":
-        return intrinsics(*(getattr(options, name) for name in PARAMETERS[:-1]))
+        notes += _filled_in(options)
+        return intrinsics(*_lens_of(options, size))
     if options.fov is not None:
         return intrinsics_from_fov(options.fov, size)
     K, of_exif = intrinsics_from_exif(path, path.name)

@@ -17,6 +17,7 @@ from geodiff_plugin.formats.out import REPORT
 from geodiff_plugin.jobs.records import PairRun
 from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.result.confidence import expected_error
+from geodiff_plugin.result.standing import standing_words
 from geodiff_plugin.runtime.machine import versions
 from geodiff_plugin.types import UNTESTED, MetricDepthOutput
 
@@ -176,7 +177,7 @@ def summary_line(report: dict[str, Any], where: str) -> str:
         report.get("expected_error_median_m"),
         report["prior_scale"],
     )
-    trusted = ["trusted if what is assumed holds" if report.get("assumed") else "trusted"]
+    trusted = [standing_words(verdict["status"], bool(report.get("assumed")))]
     trusted += [] if found["confidence"] is None else [f"confidence {found['confidence']:.2f}"]
     trusted += [] if error is None else [f"expected error {_length(error, report['unit'])}"]
     trusted += [] if found["matched"] is None else [f"{100 * found['matched']:.0f} % matched"]

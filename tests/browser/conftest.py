@@ -48,9 +48,10 @@ def visitor(chromium, address):
 
     def come(height: int = 1000, width: int = 1400):
         size = {"width": width, "height": height}
-        context = chromium.new_context(viewport=size, accept_downloads=True)
+        # Without the slow turn at first, which a software renderer would spend its time on.
+        context = chromium.new_context(viewport=size, accept_downloads=True, reduced_motion="reduce")
         contexts.append(context)
-        context.set_default_timeout(90_000)  # of a machine that does other things as well
+        context.set_default_timeout(60_000)  # of a machine that does other things as well
         page = context.new_page()
         page.on("request", note)
         page.goto(address)

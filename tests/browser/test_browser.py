@@ -17,7 +17,7 @@ NUMBER = r"(\d+\.\d+)"
 
 def run(page) -> None:
     page.click("#run")
-    page.wait_for_selector("#status .figures", timeout=RUN_MS)
+    page.wait_for_selector("#status .verdict:not(.example) .figures", timeout=RUN_MS)
 
 
 def tab(page, name: str) -> None:
@@ -42,7 +42,7 @@ def upload(page, paths) -> None:
 
 
 def download(page, name: str, folder: Path) -> Path:
-    tab(page, "Downloads")
+    tab(page, "Files")
     with page.expect_download() as started:
         page.locator(f"#files a[href*='{name}']", has_text=re.compile(r"\d")).first.click()
     started.value.save_as(folder / name)
@@ -61,6 +61,7 @@ def test_upload_run_measure_and_take_home(visitor, plane_files, tmp_path):
     upload(page, files)
     run(page)
 
+    tab(page, "Depth")
     assert " m</span>" in page.locator("#depth-legend").inner_html()
 
     # Two points, against the map that the visitor takes home.
@@ -89,8 +90,41 @@ def test_upload_run_measure_and_take_home(visitor, plane_files, tmp_path):
     assert download(page, "cloud.glb", tmp_path).read_bytes()[:4] == b"glTF"
     everything = ZipFile(download(page, "everything.zip", tmp_path)).namelist()
     assert {"confidence.npy", "depth_mm.png"} <= set(everything)
-    tab(page, "Point cloud")
-    page.wait_for_selector("#points >> text=points")
+    tab(page, "3D")
+    page.wait_for_selector(".viewer-count >> text=% of the pixels")
+    assert words in page.locator("#headline").inner_text(), "the distance, in the 3D view as well"
+
+
+def test_it_opens_with_a_result_that_can_be_measured_and_an_example_runs_at_one_click(visitor):
+    page = visitor(width=390, height=844)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390, "nothing goes sideways"
+    before = page.wait_for_selector("#headline .distance").inner_text()
+    assert re.fullmatch(rf"{NUMBER} ± {NUMBER} m", before)
+    page.wait_for_selector(".viewer-count >> text=% of the pixels")
+    page.locator(".viewer canvas").scroll_into_view_if_needed()
+    box = page.locator(".viewer canvas").bounding_box()
+    for x, y in ((0.45, 0.5), (0.6, 0.55)):
+        page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        page.wait_for_timeout(800)
+    page.wait_for_function(
+        f"() => {{ const said = document.querySelector('#headline .distance'); "
+        f"return said && said.innerText !== {before!r}; }}"
+    )
+    page.locator("#examples button").nth(1).click()
+    page.wait_for_selector("#status .verdict:not(.example) .figures", timeout=RUN_MS)
+    assert page.locator("#status .verdict.good").count() == 1, "a calibrated pair, nothing assumed"
+    said = page.locator("#status .figures").inner_text()
+    page.reload()
+    page.wait_for_selector("#status .verdict:not(.example) .figures")
+    assert page.locator("#status .figures").inner_text() == said, "the result survives"
+
+
+def test_what_is_no_picture_is_told_at_once(visitor, tmp_path):
+    page = visitor()
+    (tmp_path / "text.png").write_text("This is no picture.")
+    page.locator("#left input[type=file]").first.set_input_files(str(tmp_path / "text.png"))
+    said = page.wait_for_selector("#left-note .bad").inner_text()
+    assert "the left photograph must be an image file" in said and "/tmp" not in said
 
 
 def test_two_taps_give_the_ends_of_a_known_length(visitor, plane_files):
@@ -120,16 +154,17 @@ def test_a_result_is_judged_stale_after_a_change_and_gone_under_an_error(visitor
     page = visitor(width=width)
     upload(page, plane_files())
     run(page)
-    assert page.locator("#status .verdict b").first.inner_text() in ("Trusted", "Not trusted", "Not judged")
-    assert "fx 120.0" in page.locator("#status .cameras").inner_text() and not is_stale(page)
+    verdicts = ("Trusted", "Not trusted", "Not judged")
+    assert page.locator("#status .verdict b").first.inner_text() in verdicts
+    assert "fx 120.0" in page.locator("#status .cameras").text_content() and not is_stale(page)
     tab(page, "Measure")
     page.wait_for_selector("#measure-picture img")
-    assert page.locator(".verdict:visible").count() == 2, "again where it matters"
+    assert page.locator(".verdict:visible").count() == 1, "once, above every tab"
     field(page, "pixel").fill("32, 48")  # by keyboard
     page.keyboard.press("Enter")
     page.wait_for_selector("#readings >> text=Choose a second point")
-    tab(page, "Downloads")
-    assert page.locator(".verdict:visible").count() == 2
+    tab(page, "Files")
+    assert page.locator(".verdict:visible").count() == 1
     field(page, "baseline").fill("0.3")
     page.keyboard.press("Tab")
     page.wait_for_function("document.getElementById('results').classList.contains('stale')")
@@ -154,7 +189,7 @@ def test_two_visitors_at_once_do_not_mix(visitor, plane_files, tmp_path):
         page.click("#run")
     medians = []
     for number, page in enumerate(pages.values()):
-        page.wait_for_selector("#status .figures", timeout=RUN_MS)
+        page.wait_for_selector("#status .verdict:not(.example) .figures", timeout=RUN_MS)
         folder = tmp_path / str(number)
         folder.mkdir()
         medians.append(np.median(np.load(download(page, "depth.npy", folder))))
@@ -167,16 +202,8 @@ def test_two_visitors_at_once_do_not_mix(visitor, plane_files, tmp_path):
 
 @pytest.mark.skipif("GEODIFF_SCREENSHOT" not in os.environ, reason="GEODIFF_SCREENSHOT names no picture")
 def test_picture_for_the_docs(visitor):
-    page = visitor(height=940)
-    page.locator("#examples button").first.click()
-    page.wait_for_selector("#status .figures", timeout=RUN_MS)
-    tab(page, "Measure")
-    page.wait_for_selector("#measure-picture img")
-    click_picture(page, 0.34, 0.36)  # the bottle's top
-    page.wait_for_selector("#readings >> text=Choose a second point")
-    click_picture(page, 0.355, 0.74)  # and its foot
-    page.wait_for_selector("#readings .distance")
-    page.mouse.move(5, 5)
-    page.evaluate("scrollTo(0, 0)")
-    page.wait_for_timeout(1500)
+    page = visitor(height=900, width=1440)
+    page.emulate_media(reduced_motion="reduce")
+    page.wait_for_selector(".viewer-count >> text=% of the pixels")
+    page.wait_for_timeout(3000)
     page.screenshot(path=os.environ["GEODIFF_SCREENSHOT"])

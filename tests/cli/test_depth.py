@@ -148,6 +148,18 @@ def test_demo_on_real_pairs(geodiff, prior, pair_files, monkeypatch):
             assert np.load(f"geodiff-demo/{name}/depth.npy").shape == left.size[::-1]
 
 
+def test_a_focal_length_and_a_baseline_are_enough_and_what_stands_in_is_said(geodiff, command):
+    numbers, rest = "--fx 60 --baseline 0.12".split(), [*command[5:], *GIVEN, "--steps", 1, "-q"]
+    for name, more in (("few", ()), ("all", "--fy 60 --cx 31.5 --cy 23.5".split())):
+        answer = geodiff(*command[:3], *numbers, *more, *rest, "--out", name)
+        assert answer.code == 0, answer.err
+    few, every = report_of("few"), report_of("all")
+    assert few["inputs"]["K_left"] == every["inputs"]["K_left"]
+    assert np.array_equal(np.load("few/depth.npy"), np.load("all/depth.npy"))
+    codes = {name: [m["code"] for m in report["messages"]] for name, report in (("few", few), ("all", every))}
+    assert "camera.filled-in" in codes["few"] and "camera.filled-in" not in codes["all"]
+
+
 # Priors
 
 

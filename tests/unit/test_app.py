@@ -3,9 +3,13 @@
 import asyncio
 import gc
 import json
+import os
+import re
 import threading
+import time
+import zlib
+from base64 import b64decode
 from dataclasses import replace
-from types import SimpleNamespace
 from zipfile import ZipFile
 
 import numpy as np
@@ -14,9 +18,14 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import enable_geometry_guidance
-from geodiff_plugin.app import job, launch, results
-from geodiff_plugin.app.job import Priors, Stopped, options_of, run_job
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.app import job, keeping, launch, results
+from geodiff_plugin.app.job import Priors, options_of, run_job
+from geodiff_plugin.app.keeping import Keeper, Session, Sessions, Stopped, Turns
+from geodiff_plugin.app.shown import load, save, shown_of
 from geodiff_plugin.formats import read_calibration, read_image
+from geodiff_plugin.messages import Message
+from geodiff_plugin.result.standing import Standing, Tone
 
 K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
 DEPTH = np.full((48, 64), 2.0, np.float32)
@@ -68,7 +77,7 @@ def photographs(textured_plane, tmp_path_factory):
 def test_fields_become_options_and_those_of_another_way_are_left_out(photographs, tmp_path):
     lens = {"fx": 60.0, "fy": None, "cx": None, "cy": 20.0}
     numbers = options_of(*photographs, "numbers", ("K.txt",), 0.12, 35.5, lens, seed=3)
-    assert (numbers.fx, numbers.fy, numbers.cx, numbers.cy) == (60.0, 60.0, 31.5, 20.0)
+    assert (numbers.fx, numbers.fy, numbers.cx, numbers.cy) == (60.0, None, None, 20.0)
     assert numbers.cx_right == 35.5 and numbers.seed == 3 and numbers.calib == ()
     file = options_of(*photographs, "file", ("K.txt",), None, 35.5, lens)
     assert [path.name for path in file.calib] == ["K.txt"] and file.fx is None and file.cx_right is None
@@ -76,7 +85,7 @@ def test_fields_become_options_and_those_of_another_way_are_left_out(photographs
     exif[0x0112] = 6  # lies on its side
     Image.new("L", (64, 48)).save(tmp_path / "turned.jpg", exif=exif)
     turned = options_of(str(tmp_path / "turned.jpg"), photographs[1], "photographs", (), 0.3, 35.5, lens)
-    assert turned.estimate_pose and turned.cx == 23.5 and turned.cx_right is None
+    assert turned.estimate_pose and turned.fx == 60.0 and turned.cx_right is None
     known = {"known_length": 0.8, "ends": "12, 40.5, 50, 41"}
     tapped = options_of(*photographs, "photographs", lens=lens, **known)
     assert tapped.known_length == "12,40.5,50,41,0.8" and tapped.baseline is None
@@ -134,20 +143,20 @@ def result(priors, asked):
     done = run_job(replace(asked, ensemble=2), priors, threading.Event(), lambda *now: said.append(now))
     assert said == sorted(said) and 0 <= said[0][0] <= said[-1][0] <= 1
     assert any("Guided step" in name for _, name in said)
-    return done
+    return shown_of(done)
 
 
 def test_a_job_and_its_files(result):
-    assert results.depth_of(result).shape == results.map_of(result, "uncertainty").shape == (48, 64)
+    assert result.depth_m.shape == result.uncertainty_m.shape == (48, 64)
     paths = results.files_of(result)
     names, folder = [path.name for path in paths], paths[0].parent
     assert names[:3] == ["everything.zip", "depth_mm.png", "depth.npy"] and "confidence.npy" in names
     assert sorted(ZipFile(paths[0]).namelist()) == sorted(names[1:])
-    np.testing.assert_array_equal(np.load(folder / "depth.npy"), results.depth_of(result))
+    np.testing.assert_array_equal(np.load(folder / "depth.npy"), result.depth_m)
     report = json.loads((folder / "report.json").read_text())
     assert report["inputs"]["E"][0][3] == pytest.approx(0.12) and report["arguments"]["left"] == "left.png"
     assert report["arguments"]["ensemble"] == 2 and "cx is assumed" in " ".join(report["warnings"])
-    assert report["verdict"]["status"] == result.run.output.verdict.status
+    assert report["verdict"]["status"] == result.standing.status
     pixels = [(5, 5), (50, 40), (20, 20)]
     with ZipFile(results.files_of(result, pixels)[0]) as archive:  # which does not hold itself
         assert sorted(archive.namelist()) == sorted([*names[1:], "measurements.csv"])
@@ -160,11 +169,101 @@ def test_a_job_and_its_files(result):
 
 
 def test_points_are_marked_where_they_were_clicked_and_told_in_words(result):
-    picture, words = results.measurement(result, [(5, 5), (50, 40), (20, 20)])
-    assert picture.shape == (48, 64, 3) and "Distance A to B" in words and "second point" in words
-    assert picture[5, 5].tolist() == picture[40, 50].tolist() == [0xC2, 0x41, 0x0C]
+    found = results.measurement(result, [(5, 5), (50, 40), (20, 20)])
+    assert found.picture.shape == (48, 64, 3)
+    assert "Distance A to B" in found.words and "second point" in found.words
+    assert found.picture[5, 5].tolist() == found.picture[40, 50].tolist() == [0xC2, 0x41, 0x0C]
     assert ">5 m</span>" in results.legend_of_depth(np.geomspace(1, 10, 1000).reshape(20, 50))
     assert ">50 %</span>" in results.legend_of_confidence()
+    marks = json.loads(results.marks_data(found.readings))
+    assert [point["name"] for point in marks["points"]] == ["A", "B", "C"]
+    assert [segment["ends"] for segment in marks["segments"]] == [[0, 1]]
+    np.testing.assert_allclose(marks["points"][1]["at"], found.readings[1].point_m, atol=1e-4)
+
+
+def test_the_3d_view_gets_depth_and_confidence_of_every_pixel_that_it_draws(result):
+    depth_m = np.full_like(result.depth_m, 2.0)
+    depth_m[:4] = 500.0  # a sky
+    depth_m[20, 20] = np.nan
+    data = json.loads(results.scene_data(replace(result, depth_m=depth_m)))
+    assert (data["width"], data["height"], data["w"], data["h"], data["stride"]) == (64, 48, 64, 48, 1)
+    raw = zlib.decompress(b64decode(data["maps"]))
+    z = np.frombuffer(raw, "<u2", 48 * 64).reshape(48, 64) * data["unit"]
+    assert (z[:4] == 0).all() and z[20, 20] == 0
+    drawn = z > 0
+    np.testing.assert_allclose(z[drawn], 2.0, rtol=1e-4)
+    assert drawn.sum() == 44 * 64 - 1
+    sure = np.frombuffer(raw, np.uint8, offset=2 * 48 * 64).reshape(48, 64) / 255
+    np.testing.assert_allclose(sure, result.confidence, atol=1 / 255)
+    assert len(data["cameras"]) == 2 and len(data["cameras"][0]["edges"]) == 16
+
+
+def test_a_stored_result_reads_back_as_it_was(result, photographs, tmp_path):
+    save(tmp_path / "first.npz", result, [(5, 5), (50, 40)])
+    again, pixels = load(tmp_path / "first.npz", photographs[0], "an example")
+    assert pixels == [(5, 5), (50, 40)] and again.standing == result.standing
+    assert [m.code for m in again.messages] == [m.code for m in result.messages]
+    np.testing.assert_allclose(again.depth_m, result.depth_m, atol=5e-4)
+    np.testing.assert_array_equal(again.photograph, result.photograph)
+    np.testing.assert_allclose(again.views[1].E, result.views[1].E)
+
+
+def test_a_result_is_kept_for_its_secret_alone_and_for_its_time(result, tmp_path, monkeypatch):
+    shown, keeper = replace(result, folder=tmp_path / "gone"), Keeper()
+    shown.folder.mkdir()
+    secret = keeper.add(shown)
+    assert keeper.get(secret) is shown and keeper.get("guess") is None
+    monkeypatch.setattr(keeping, "AWAY_S", 0.05)
+    sessions = Sessions(keeper)
+    sessions.of("tab").secret = secret
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    sessions.leave("tab")
+    end = time.monotonic() + 20
+    while keeper.get(secret) is not None and time.monotonic() < end:
+        time.sleep(0.02)
+    assert keeper.get(secret) is None and not shown.folder.exists()
+
+
+def test_uploads_go_with_their_last_visitor_and_empty_folders_with_them(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    mine, both, empty = (tmp_path / name for name in ("mine", "both", "empty"))
+    for folder in (mine, both, empty):
+        folder.mkdir()
+    (mine / "left.png").touch(), (both / "right.png").touch()
+    os.utime(empty, (0, 0))
+    sessions = Sessions(Keeper())
+    sessions.of("a").uploads |= {mine, both}
+    sessions.of("b").uploads |= {both}
+    sessions.leave("a")
+    assert not mine.exists() and both.exists() and not empty.exists()
+
+
+def test_runs_take_turns_one_a_visitor_and_few_wait(monkeypatch):
+    turns, first, second, third = Turns(), Session(), Session(), Session()
+    with turns.turn(first, lambda _: None):
+        with pytest.raises(InputError, match="Your last run still works"), turns.turn(first, print):
+            pass
+
+        def stop_after(before: int) -> None:
+            assert before == 1
+            second.stop.set()
+
+        with pytest.raises(Stopped), turns.turn(second, stop_after):
+            pass
+        monkeypatch.setattr(keeping, "MOST_WAITING", 0)
+        with pytest.raises(InputError, match="Many visitors are waiting"), turns.turn(third, print):
+            pass
+    monkeypatch.undo()
+    with turns.turn(second, lambda _: None):
+        assert second.runs
+    assert not second.runs
+
+
+def test_a_picture_that_is_far_too_large_is_refused_by_its_head(tmp_path):
+    path = tmp_path / "huge.png"
+    Image.new("1", (30_000, 30_000)).save(path)  # 900 megapixels in a small file
+    with pytest.raises(InputError, match="the left photograph is far too large: at most 16 megapixels"):
+        job.photograph_size(str(path), "the left photograph")
 
 
 def test_a_stop_ends_a_job_between_steps(priors, asked):
@@ -200,8 +299,39 @@ def test_without_gradio_it_says_what_to_install(monkeypatch):
 )
 def test_requests_of_other_sites_are_foreign(origin, foreign):
     headers = {b"host": b"a:1"} | ({b"origin": origin.encode()} if origin else {})
-    assert launch._is_foreign(headers) == foreign
+    assert bool(launch._refused(headers, ("10.0.0.1", 1))) == foreign
     assert "ws:" not in launch.POLICY and "http" not in launch.POLICY
+
+
+@pytest.mark.parametrize(
+    ("host", "server", "refused"),
+    [
+        ("localhost:7860", "127.0.0.1", False),
+        ("127.0.0.1:7860", "127.0.0.1", False),
+        ("[::1]:7860", "::1", False),
+        ("evil.example:7860", "127.0.0.1", True),
+        ("", "127.0.0.1", True),
+        ("my-machine:7860", "192.168.1.5", False),
+    ],
+)
+def test_a_server_of_this_machine_alone_is_not_reached_by_a_name_that_was_bound_to_it(host, server, refused):
+    assert bool(launch._refused({b"host": host.encode()}, (server, 7860))) == refused
+
+
+def test_every_answer_has_the_headers_of_a_page_that_nobody_frames():
+    async def page(_scope, _receive, send):
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+
+    sent = []
+
+    async def send(message):
+        sent.append(message)
+
+    scope = {"type": "http", "headers": [(b"host", b"localhost")], "server": ("127.0.0.1", 1)}
+    asyncio.run(launch._Guard(page)(scope, None, send))
+    headers = dict(sent[0]["headers"])
+    assert b"frame-ancestors 'self'" in headers[b"content-security-policy"]
+    assert headers[b"x-content-type-options"] == b"nosniff" and b"referrer-policy" in headers
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # gradio 6.31 leaves files and sockets open
@@ -221,11 +351,13 @@ class TestWithGradio:
 
         with gradio.Blocks():
             form = build_form(priors)
-        for number, (folder, _) in enumerate(EXAMPLES):
+        for number, example in enumerate(EXAMPLES):
+            folder = example.folder
             options = form.options(tuple(form.example(number)))
             assert options.baseline is None and not options.estimate_pose
             monkeypatch.setattr("tempfile.tempdir", str(folder.parent))  # gradio's copies lie there
-            assert not _uploads(options), "no visitor takes an example along"
+            given = [*options.photographs().values(), *options.calib]
+            assert not _uploads([str(path) for path in given]), "no visitor takes an example along"
             rig = read_calibration(options.calib)
             for path in options.photographs().values():
                 image, notes = read_image(path, "image")
@@ -253,25 +385,31 @@ class TestWithGradio:
         assert read_image(given[1])[0].shape == (64, 48, 3), "turned upright"
 
     def test_what_visitors_read_has_no_path_and_no_option(self):
-        from geodiff_plugin.app.page import for_visitors
+        from geodiff_plugin.app.look import for_visitors
 
         said = "LEFT must be an image; got /tmp/x/left.png. Give --fx, or widen depth_range (--near, --far)."
         told = "the left photograph must be an image; got left.png. Give fx, or widen depth_range."
         assert for_visitors(said) == told
 
-    def test_a_sentence_of_the_page_has_its_code(self):
-        from geodiff_plugin.app.look import finished
+    def test_the_banner_has_the_words_of_the_command_and_the_cure_of_an_assumption(self, result):
+        from geodiff_plugin.app.look import banner
 
-        shown = finished("not trusted", [], [("pose.inverse", "a < b")], "")
-        assert '<li data-code="pose.inverse">a &lt; b</li>' in shown
+        assumed = Message("camera.same-centre", "The right camera's cx is assumed & so on.")
+        standing = Standing("trusted", Tone.CAUTION, "trusted if what is assumed holds", (assumed,))
+        shown = banner(replace(result, standing=standing))
+        assert 'class="verdict caution"' in shown and "<b>Trusted if what is assumed holds</b>" in shown
+        assert '<li data-code="camera.same-centre">The right camera' in shown and "&amp; so on" in shown
+        assert "Give the right camera" in shown and "--" not in re.sub("<[^>]*>", "", shown)
 
-    def test_a_forgotten_result_leaves_no_files_and_no_maps(self, tmp_path):
-        from geodiff_plugin.app.page import _forget
+    def test_the_page_opens_with_a_result_whose_distance_has_an_error(self):
+        from geodiff_plugin.app.page import read_first_result
 
-        result = SimpleNamespace(folder=tmp_path, run=SimpleNamespace(inputs=[], output=[]))
-        for _ in range(2):  # when the tab is closed, and by gradio later
-            _forget(result)
-        assert not tmp_path.exists() and not vars(result.run)
+        first = read_first_result()
+        assert first.shown.photograph.shape[:2] == first.shown.depth_m.shape and len(first.pixels) == 2
+        found = results.measurement(first.shown, first.pixels)
+        length, spread = results.distance_m(*found.readings)
+        assert 0.1 < length < 1 and 0 < spread < length / 3
+        assert results.metres(length, spread) in found.headline and "bring your own pair" in found.headline
 
     def test_a_port_that_another_program_has_is_a_sentence(self, monkeypatch):
         def taken(*_args, **_options):
