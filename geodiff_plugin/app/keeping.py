@@ -113,11 +113,12 @@ class Sessions:
         return self._of.setdefault(name, Session())
 
     def leave(self, name: str | None) -> None:
-        """End a session's run, delete the uploads that no other one has, and soon its result."""
+        """End a session's run, and delete what no other one has: the uploads now, its result soon."""
         session = self._of.pop(name, Session())
         session.stop.set()
         delete_uploads(session.uploads.difference(*(other.uploads for other in self._of.values())))
-        self.keeper.end_in(session.secret, AWAY_S)
+        if all(other.secret != session.secret for other in self._of.values()):  # a reloaded tab has it again
+            self.keeper.end_in(session.secret, AWAY_S)
 
 
 class Turns:

@@ -74,9 +74,9 @@ class Panels:
 
 @dataclass(frozen=True)
 class Memory:
-    """What the server knows of one open tab between its clicks."""
+    """What is known of one open tab between its clicks."""
 
-    secret: gr.State  # of the result that is shown; empty for the one made beforehand
+    secret: gr.Textbox  # of the result that is shown, or empty; hidden in the browser
     pixels: gr.State  # that were chosen in it
 
 
@@ -346,8 +346,7 @@ def build_page(priors: Priors) -> gr.Blocks:
         fill_width=True,
     ) as page:
         gr.HTML(look.HEADER)
-        memory = Memory(gr.State(""), gr.State(first.pixels))
-        secret = gr.Textbox(visible="hidden")
+        memory = Memory(gr.Textbox(visible="hidden"), gr.State(first.pixels))
         with gr.Row(equal_height=False, elem_id="main"):
             with gr.Column(elem_id="examples-part"):
                 examples = build_examples()
@@ -360,6 +359,6 @@ def build_page(priors: Priors) -> gr.Blocks:
         _wire_form(desk)
         _wire_measuring(desk, first)
         shows = [*panels.of_result(), memory.secret, memory.pixels]
-        page.load(desk.come_back, secret, shows, js=look.COME_BACK, **QUICK)
+        page.load(desk.come_back, memory.secret, shows, js=look.COME_BACK, **QUICK)
         page.unload(desk.leave)
     return page
