@@ -1,0 +1,1 @@
+"""Pictures of README and the documentation: ``python -m tests.pictures --help``."""

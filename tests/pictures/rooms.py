@@ -1,0 +1,112 @@
+"""Ordinary rooms seen by an OAK-D, and what a guided call makes of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior
+from geodiff_plugin.formats.clouds import flying_points
+
+#: One calibration for all pairs of its folder, as the author of these pictures wrote it.
+CALIBRATION = "stereodemo_calibration.json"
+Clicks = tuple[tuple[int, int], tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class Room:
+    """A pair ``NAME_left.png``, ``NAME_right.png``, and between which pixels of it something is measured."""
+
+    name: str
+    title: str
+    thing: str
+    clicks: Clicks
+
+
+ROOMS = (
+    Room("cycles", "a hallway", "scooter", ((232, 192), (232, 318))),
+    Room("toy", "a play mat", "toy bench", ((278, 300), (410, 300))),
+    Room("desk", "a desk", "screen", ((279, 150), (402, 146))),
+    Room("corridor", "a landing", "door", ((228, 260), (318, 260))),
+    Room("living_room", "a living room", "table", ((270, 330), (420, 330))),
+    Room("donkey_toy", "a rocking toy", "runner", ((140, 310), (395, 340))),
+)
+
+
+@dataclass(frozen=True)
+class RoomResult:
+    """A pair without the bands that rectification left, and the output of the default with the bundled prior.
+
+    ``left``, ``right`` are ``(H, W, 3)`` uint8; ``depth_m`` and ``confidence`` ``(H, W)``; ``prior`` is the
+    relative map ``(H, W)`` of the plain call; ``K`` ``(3, 3)`` is in their pixels.
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    prior: np.ndarray
+    depth_m: np.ndarray
+    confidence: np.ndarray
+    K: np.ndarray
+    baseline_m: float
+    status: str
+    reasons: Sequence[str]
+
+    @property
+    def solid(self) -> np.ndarray:
+        """``(H, W)``: pixels whose depth is on a surface and not between two."""
+        return ~flying_points(self.depth_m)
+
+
+def room_named(name: str) -> Room:
+    """``KeyError`` for a name that ``ROOMS`` does not have."""
+    return {room.name: room for room in ROOMS}[name]
+
+
+@lru_cache
+def _prior() -> Any:
+    return enable_geometry_guidance(load_prior("bundled"))
+
+
+def _read(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray, Rig]:
+    """Both pictures and their rig, cut to the rectangle that the cameras filled."""
+    told = json.loads((folder / CALIBRATION).read_text())
+    x0, y0, x1, y1 = told["left_image_rect_normalized"]
+    columns = slice(round(x0 * told["width"]), round(x1 * told["width"]))
+    rows = slice(round(y0 * told["height"]), round(y1 * told["height"]))
+    left, right = (
+        np.asarray(Image.open(folder / f"{name}_{side}.png").convert("RGB"))[rows, columns]
+        for side in ("left", "right")
+    )
+    centres = [(told[key] - columns.start, told["cy"] - rows.start) for key in ("cx0", "cx1")]
+    K_left, K_right = (np.array([[told["fx"], 0, cx], [0, told["fy"], cy], [0, 0, 1]]) for cx, cy in centres)
+    E = np.eye(4)
+    E[0, 3] = told["baseline_meters"]
+    return left, right, Rig(K_left, K_right, E)
+
+
+def solve(folder: Path, room: Room) -> RoomResult:
+    """A plain and a guided call on a pair of ``folder``, seed 0."""
+    left, right, rig = _read(folder, room.name)
+    picture, pipe = Image.fromarray(left), _prior()
+    guidance = GeometryGuidance(Image.fromarray(right), (rig.K_left, rig.K_right), rig.E)
+    out = pipe(picture, guidance=guidance, generator=torch.Generator().manual_seed(0))
+    plain = pipe(picture, generator=torch.Generator().manual_seed(0))
+    return RoomResult(
+        left=left,
+        right=right,
+        prior=np.asarray(plain.prediction)[0, ..., 0],
+        depth_m=np.asarray(out.prediction)[0, ..., 0],
+        confidence=np.asarray(out.confidence)[0, ..., 0],
+        K=rig.K_left,
+        baseline_m=float(np.linalg.norm(rig.E[:3, 3])),
+        status=out.verdict.status,
+        reasons=[str(reason) for reason in out.verdict.reasons],
+    )
