@@ -21,7 +21,7 @@ from tests.pictures.rooms import ROOMS, room_named, solve
 IMAGES = Path("docs/images")
 #: The room of the moving picture, those of README's tiles, and that of prior beside guided depth.
 MOVING = "toy"
-TILES = ("cycles", "toy", "corridor")
+TILES = ("cycles", "toy", "desk")
 SLIDER = "toy"
 
 app = typer.Typer(help="Make pictures of README and the documentation.", **APPEARANCE)
