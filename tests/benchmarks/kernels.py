@@ -63,7 +63,7 @@ def _of_the_matching() -> Iterator[Compiled]:
         axes = {"DOWN": (1, 0, 1, 1), "ACROSS": (0, 1, 1, -1), "PADDED": planes}
         warps = matching.path_warps(planes)
         yield Compiled(f"paths, {planes} planes", matching.paths_kernel, paths, axes, warps)
-    winner = "*i32 *u8 *i1 *fp32 *fp32 *fp32 *fp32" + 9 * " i32"
+    winner = "*i32 *u8 *i1 *fp32 *fp32 *fp32 *fp32 *fp32" + 9 * " i32"
     for evidence, padded in ((True, 128), (False, 128), (True, 4096)):
         sizes = {"EVIDENCE": evidence, "BLOCK": max(1, 1024 // padded), "PADDED": padded}
         name = f"winner{' and evidence' if evidence else ''}, {padded} planes"
