@@ -21,7 +21,7 @@ from geodiff_plugin.app.shown import Shown
 #: A result is deleted after this long.
 FORGET_AFTER_S = 600
 #: A tab that was closed may come back within this time, as on a reload.
-AWAY_S = 60
+AWAY_S = 10
 #: Runs that wait; a further visitor is asked to come back.
 MOST_WAITING = 8
 #: An empty folder of uploads that is younger may be about to get a file.

@@ -16,7 +16,7 @@ HEADER = """
 <div class="head">
   <h1>Depth in metres from two photographs</h1>
   <p>A diffusion model gives the shape, a second photograph from a known place the metres.
-  Your pictures and results are deleted after ten minutes, or a minute after you close this tab.</p>
+  Your pictures and results are deleted after ten minutes, or ten seconds after you close this tab.</p>
 </div>
 """
 BUSY = '<div class="say say-busy"></div>'

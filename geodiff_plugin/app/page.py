@@ -8,6 +8,7 @@ import sys
 import tempfile
 import threading
 import traceback
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,7 @@ class Panels:
     pixel: gr.Textbox
     add: gr.Button
     clear: gr.Button
+    paths: gr.File  # what ``files`` links to, for programs that ask over the API
 
     def of_result(self) -> list[gr.HTML]:
         """Those whose value is made of a result."""
@@ -122,8 +124,8 @@ def _measured(shown: Shown, pixels: Pixels) -> dict[str, str]:
     }
 
 
-def _drawn(shown: Shown, pixels: Pixels) -> dict[str, str]:
-    """HTML of every panel for a result."""
+def _drawn(shown: Shown, pixels: Pixels, paths: Sequence[Path] = ()) -> dict[str, str]:
+    """HTML of every panel for a result, with its files."""
     photograph, depth = (results.picture(shown, name) for name in ("photograph", "depth"))
     assert photograph is not None and depth is not None
     sure = results.picture(shown, "confidence")
@@ -137,7 +139,7 @@ def _drawn(shown: Shown, pixels: Pixels) -> dict[str, str]:
         "depth": look.compared(results.data_url(photograph), results.data_url(depth)),
         "legend": results.legend_of_depth(shown.depth_m),
         "confidence": confidence,
-        "files": look.files(results.files_of(shown, pixels)),
+        "files": look.files(paths),
         **_measured(shown, pixels),
     }
 
@@ -164,13 +166,25 @@ class _Desk:
         """Values of components by the names of panels."""
         return {getattr(self.panels, name): value for name, value in html.items()}
 
+    def of_result(self) -> list[Any]:
+        """What a new result changes, in the order in which programs get it."""
+        return [*self.panels.of_result(), self.panels.paths, self.memory.secret, self.memory.pixels]
+
     def show(self, secret: str, shown: Shown) -> dict[Any, Any]:
         """Everything on a new result."""
-        return {self.memory.secret: secret, self.memory.pixels: [], **self.on_panels(_drawn(shown, []))}
+        paths = results.files_of(shown)
+        html = self.on_panels(_drawn(shown, [], paths))
+        return {
+            self.panels.paths: [str(path) for path in paths],
+            self.memory.secret: secret,
+            self.memory.pixels: [],
+            **html,
+        }
 
     def show_nothing(self, status: str) -> dict[Any, Any]:
         """Nothing, and why."""
-        return {self.memory.secret: "", self.memory.pixels: [], **self.on_panels(_nothing(status))}
+        html = self.on_panels(_nothing(status))
+        return {self.panels.paths: None, self.memory.secret: "", self.memory.pixels: [], **html}
 
     def run(self, session: Session, filled: tuple[Any, ...], progress: Any) -> Shown:
         """The result of the fields as a visitor filled them in."""
@@ -249,7 +263,7 @@ def _wire_run(desk: _Desk, examples: gr.Gallery) -> None:
         begins(desk.come, outputs=panels.status, js=look.RUN_BEGINS, **QUICK).then(
             desk.estimate,
             fields_of_form,
-            [*panels.of_result(), memory.secret, memory.pixels],
+            desk.of_result(),
             concurrency_limit=None,
             show_progress="full",
             show_progress_on=panels.status,
@@ -333,6 +347,7 @@ def _build_panels(html: dict[str, str]) -> Panels:
             drawn["confidence"] = gr.HTML(html["confidence"], elem_id="confidence")
         with gr.Tab(FILES_TAB):
             drawn["files"] = gr.HTML(html["files"], elem_id="files")
+            drawn["paths"] = gr.File(file_count="multiple", interactive=False, visible=False)
     return Panels(**drawn)
 
 
@@ -358,7 +373,6 @@ def build_page(priors: Priors) -> gr.Blocks:
         _wire_run(desk, examples)
         _wire_form(desk)
         _wire_measuring(desk, first)
-        shows = [*panels.of_result(), memory.secret, memory.pixels]
-        page.load(desk.come_back, memory.secret, shows, js=look.COME_BACK, **QUICK)
+        page.load(desk.come_back, memory.secret, desk.of_result(), js=look.COME_BACK, **QUICK)
         page.unload(desk.leave)
     return page
