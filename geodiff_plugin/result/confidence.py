@@ -13,7 +13,6 @@ from geodiff_plugin._kernels import launch_bound
 from geodiff_plugin._strips import STRIP_PIXELS, row_strips
 from geodiff_plugin.algorithm.terms import match_exposure
 from geodiff_plugin.geometry import as_fine_as, image_size, warp_right_to_left
-from geodiff_plugin.matching import Matches, known_share
 from geodiff_plugin.types import CameraView
 
 #: Standard deviation of a good match, pixels of the left image.
@@ -48,9 +47,9 @@ DETERMINED_FROM = 0.33
 _HALF_KNOWN = 0.1
 
 
-def determined(target: Matches, size: tuple[int, int]) -> Tensor:
-    """How far matches determine a depth, ``(1, 1, H, W)`` in [0, 1]: less where they know little."""
-    share = (known_share(target) / DETERMINED_FROM).clamp_max(1.0)
+def determined(known: Tensor, size: tuple[int, int]) -> Tensor:
+    """How far matches determine a depth, ``(1, 1, H, W)`` in [0, 1], by their ``known_share``."""
+    share = (known / DETERMINED_FROM).clamp_max(1.0)
     return F.interpolate(share, size, mode="bilinear", align_corners=False)
 
 

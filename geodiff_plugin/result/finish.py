@@ -19,7 +19,7 @@ from geodiff_plugin.algorithm.member import Member
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.geometry import image_size, resize_intrinsics
-from geodiff_plugin.matching import Matches, build_cost_volume, match_volume
+from geodiff_plugin.matching import Matches, build_cost_volume, known_share, match_volume
 from geodiff_plugin.messages import Message
 from geodiff_plugin.result.confidence import depth_confidence, determined, reprojection
 from geodiff_plugin.result.ensemble import ensemble_metric, median, spread_around
@@ -200,8 +200,9 @@ def refine(
         fitted_m = flatten(fitted_m, target, left_01, measured)
         target = correction_target(matches, points, weight, error, fitted_m)
         assert target is not None  # there are matches
-        fitted_m = vote_depth(fitted_m, evidence.native, target, measured, spacing)
-        support = support * determined(target, image_size(support))
+        known = known_share(target)
+        fitted_m = vote_depth(fitted_m, evidence.native, target, known, measured, spacing)
+        support = support * determined(known, image_size(support))
     return Refined(fitted_m, support)
 
 

@@ -21,7 +21,7 @@ from geodiff_plugin._kernels import launch_bound
 from geodiff_plugin.algorithm.correction import highest, range_around
 from geodiff_plugin.algorithm.edges import HALF, REACH, STRIP
 from geodiff_plugin.geometry import image_size, is_rectified, resize_image, to_device_of
-from geodiff_plugin.matching import Matches, known_share
+from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.rows import match_rows
 from geodiff_plugin.types import CameraView, PosedViews
 
@@ -81,7 +81,12 @@ class _Votes(NamedTuple):
 
 @torch.no_grad()
 def vote_depth(
-    depth_m: Tensor, native: PosedViews, target: Matches, error: Tensor, spacing: float = 1.0
+    depth_m: Tensor,
+    native: PosedViews,
+    target: Matches,
+    known: Tensor,
+    error: Tensor,
+    spacing: float = 1.0,
 ) -> Tensor:
     """Give every pixel the depth voted by the map and by the matches around it that have its colour.
 
@@ -101,6 +106,7 @@ def vote_depth(
         depth_m: ``(1, 1, H, W)`` metres, fitted to the matches.
         native: the image and its right views at their own sizes.
         target: matches and known points, on any grid.
+        known: their ``known_share``.
         error: ``(1, 1, 1, 1)`` of the prior in log depth: how much contradicting matches, and the map, count.
         spacing: pixels of the map per pixel of the grid that it was decoded on.
 
@@ -119,7 +125,7 @@ def vote_depth(
     # Nearest: a mean across an edge is the depth of neither surface.
     small_m, inverse_depth, confidence, known = (
         F.interpolate(each.float(), size, mode="nearest-exact")[0, 0]
-        for each in (depth_m, target.inverse_depth, target.confidence, known_share(target))
+        for each in (depth_m, target.inverse_depth, target.confidence, known)
     )
     px = (K[0, 0] * view.T_right_from_left[0, 3]).abs()  # shift of a depth of 1 m
     shift, matched_px = px / small_m, px * inverse_depth

@@ -29,7 +29,7 @@ from geodiff_plugin.config import DEFAULT, MARIGOLD_DC, PAPER, UpdatePlan
 from geodiff_plugin.evidence.prepare import prepare_evidence
 from geodiff_plugin.formats.images import intrinsics_from_exif
 from geodiff_plugin.geometry import hidden_in_right, is_rectified, project, resize_image, warp_right_to_left
-from geodiff_plugin.matching import build_cost_volume, points_to_matches, with_points
+from geodiff_plugin.matching import build_cost_volume, known_share, points_to_matches, with_points
 from geodiff_plugin.matching.build import inverse_pose_preferred
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches, reject_reflections
@@ -395,7 +395,8 @@ def finished() -> dict[str, object]:
     rectified = CameraView(torch.roll(left, -6, -1), K, T)
     for e in (0.03, 0.12):
         error = torch.full((1, 1, 1, 1), e)
-        voted_m = vote_depth(depth_m, PosedViews(left, (*views, rectified), K), target, error)
+        native = PosedViews(left, (*views, rectified), K)
+        voted_m = vote_depth(depth_m, native, target, known_share(target), error)
         result[f"voted_{e}"] = (voted_m / depth_m).log()
     return result
 

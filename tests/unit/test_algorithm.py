@@ -13,7 +13,7 @@ from geodiff_plugin.algorithm.gradients import RULES, Adam, FiniteWatch, power_a
 from geodiff_plugin.algorithm.schedule import count_steps, make_schedule
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
 from geodiff_plugin.config import DEFAULT
-from geodiff_plugin.matching import Matches
+from geodiff_plugin.matching import Matches, known_share
 from geodiff_plugin.matching.rows import match_rows
 from geodiff_plugin.result import voting
 from geodiff_plugin.result.confidence import MATCH_NOISE_PX, expected_error
@@ -291,7 +291,7 @@ def scene(side: int = 1, doffs: float = 0.0) -> tuple[Tensor, Tensor, CameraView
 def voted(map_m: Tensor, left: Tensor, views, matched_m: Tensor, confidence: float, error=0.4, *spacing):
     target = Matches(1.0 / matched_m, torch.full_like(matched_m, confidence), torch.full((1,), 2e-3))
     native = PosedViews(left[0], tuple(views), CAMERA)
-    return vote_depth(map_m, native, target, torch.full((1, 1, 1, 1), error), *spacing)
+    return vote_depth(map_m, native, target, known_share(target), torch.full((1, 1, 1, 1), error), *spacing)
 
 
 @pytest.mark.parametrize(("side", "doffs"), [(1, 0.0), (-1, 0.0), (1, 4.0), (-1, 4.0)])

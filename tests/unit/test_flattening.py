@@ -54,8 +54,10 @@ def test_a_pixel_without_a_match_knows_nothing_and_points_stand_for_their_surrou
 
 def test_matches_that_know_little_determine_little() -> None:
     size = (96, 128)
-    assert (determined(matches_of(1.0), size) == 1.0).all()
-    wide = determined(matches_of(10.0), size)  # a precision of .01, of the .3 and of a third of it
+    assert (determined(known_share(matches_of(1.0)), size) == 1.0).all()
+    wide = determined(
+        known_share(matches_of(10.0)), size
+    )  # a precision of .01, of the .3 and of a third of it
     torch.testing.assert_close(wide, torch.full((1, 1, *size), 0.01 / ENOUGH_KNOWN / DETERMINED_FROM))
 
 
