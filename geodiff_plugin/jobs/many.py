@@ -25,7 +25,7 @@ from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard
 from geodiff_plugin.jobs.options import DepthOptions, start_pair
 from geodiff_plugin.jobs.pair import run_pair, write_pair
 from geodiff_plugin.jobs.pairs import COLUMNS, SUMMARY, PairRef, options_of
-from geodiff_plugin.jobs.prior import prior_of_options
+from geodiff_plugin.jobs.prior import graphs_for_many, prior_of_options
 from geodiff_plugin.jobs.reading import PairInputs, read_pair
 from geodiff_plugin.jobs.records import JobLog, PairRun
 from geodiff_plugin.jobs.runner import Runner
@@ -136,8 +136,7 @@ class Stages:
         if self._pipe is None:
             try:
                 tell = None if self._tell is silent else self._tell
-                # Pictures of a folder mostly have one size, for which recording pays.
-                graphs = self._options.graphs or self._device.type == "cuda"
+                graphs = graphs_for_many(self._options, self._device)
                 self._pipe = prior_of_options(replace(self._options, graphs=graphs), self._device, tell)
             except Exception as error:
                 raise _EndsRun from error

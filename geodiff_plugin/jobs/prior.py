@@ -12,6 +12,7 @@ import torch
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.telling import Tell
+from geodiff_plugin.options import SpeedOptions
 from geodiff_plugin.priors import find_prior
 from geodiff_plugin.priors.loading import no_bars
 from geodiff_plugin.priors.pipeline import DepthDiffusionPipeline
@@ -53,6 +54,11 @@ def load_guided_prior(
             bad_value("--option", expected, repr(option))
     pipe.set_progress_bar_config(disable=True)
     return enable_geometry_guidance(pipe)
+
+
+def graphs_for_many(options: SpeedOptions, device: torch.device) -> bool:
+    """Whether a job of many pictures records its networks: they mostly have one size, for which that pays."""
+    return options.graphs or device.type == "cuda"
 
 
 def prior_of_options(options: DepthOptions, device: torch.device, tell: Tell | None = None) -> Any:

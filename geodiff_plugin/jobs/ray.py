@@ -29,7 +29,7 @@ from geodiff_plugin.jobs.finished import Row
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pair import run_pair
 from geodiff_plugin.jobs.pairs import PairRef
-from geodiff_plugin.jobs.prior import prior_of_options
+from geodiff_plugin.jobs.prior import graphs_for_many, prior_of_options
 from geodiff_plugin.jobs.rows import (
     COLUMNS,
     IMAGES,
@@ -212,8 +212,8 @@ class _Guide:
 
     def __init__(self, options: DepthOptions) -> None:
         device = pick_device(options.device)
-        graphs = options.graphs or device.type == "cuda"  # the pictures of a job mostly have one size
-        self._pipe = prior_of_options(replace(options, graphs=graphs), device)
+        options = replace(options, graphs=graphs_for_many(options, device))
+        self._pipe = prior_of_options(options, device)
 
     def __call__(self, row: Row) -> Row:
         return _hand_over(*attempt(row, self._run))
