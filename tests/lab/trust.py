@@ -41,7 +41,8 @@ POINTS = 200
 Change = Callable[[StereoSample, StereoSample], StereoSample]
 
 
-def _moved(sample: StereoSample, centre: np.ndarray) -> StereoSample:
+def moved(sample: StereoSample, centre: np.ndarray) -> StereoSample:
+    """The sample with its right camera at ``centre (3,)``, metres."""
     E = sample.E.copy()
     E[:3, 3] = centre
     return replace(sample, E=E)
@@ -148,11 +149,11 @@ KINDS: dict[str, Kind] = {
     "right, points": Kind("correct, points", points=1.0),
     "swapped": Kind("left and right images exchanged", lambda s, _: replace(s, left=s.right, right=s.left)),
     "inverse": Kind("E is world-to-camera", lambda s, _: replace(s, E=np.linalg.inv(s.E))),
-    "axis": Kind("E along y where it is along x", lambda s, _: _moved(s, s.E[[1, 0, 2], 3])),
+    "axis": Kind("E along y where it is along x", lambda s, _: moved(s, s.E[[1, 0, 2], 3])),
     "tilted": Kind("not rectified: 2 degrees of pitch", _tilted),
     "mirrored": Kind("right image mirrored", lambda s, _: replace(s, right=s.right[:, ::-1].copy())),
-    "millimetres": Kind("baseline in millimetres", lambda s, _: _moved(s, s.E[:3, 3] * 1000.0)),
-    "thousandth": Kind("baseline divided by 1000 once too often", lambda s, _: _moved(s, s.E[:3, 3] * 0.001)),
+    "millimetres": Kind("baseline in millimetres", lambda s, _: moved(s, s.E[:3, 3] * 1000.0)),
+    "thousandth": Kind("baseline divided by 1000 once too often", lambda s, _: moved(s, s.E[:3, 3] * 0.001)),
     "K-1.5": Kind("K of an image 1.5 times as large, centred", lambda s, _: _scaled(s, 1.5)),
     "K-2": Kind("K of an image twice as large, centred", lambda s, _: _scaled(s, 2.0)),
     "K-0.67": Kind("K of an image 0.67 times as large, centred", lambda s, _: _scaled(s, 0.67)),

@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
+from geodiff_plugin import Rig
 from geodiff_plugin.evaluation.metrics import align
 from geodiff_plugin.formats.out import atomic_path
+from geodiff_plugin.jobs.report import single_map
 from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, grid
 from tests.pictures.moving import measured
 from tests.pictures.orbit import look_from, surface_of
-from tests.pictures.rooms import Room, RoomResult
+from tests.pictures.rooms import Room, RoomResult, call, guidance_of
 from tests.scenes.dataset import find_synthetic, load_synthetic
 
 #: Width of a picture in a row of tiles, and of one in the gallery, pixels.
@@ -74,14 +74,11 @@ def write_slider(result: RoomResult, folder: Path) -> None:
 
 def write_rendered(folder: Path) -> None:
     """``rendered-1.webp`` and so on: left image, depth, and how far it is from the truth."""
-    pipe = enable_geometry_guidance(load_prior("bundled"))
     for number, ref in enumerate(find_synthetic(Path(RENDERED)), 1):
         sample = load_synthetic(ref)
-        guidance = GeometryGuidance(Image.fromarray(sample.right), (sample.K_left, sample.K_right), sample.E)
-        out = pipe(
-            Image.fromarray(sample.left), guidance=guidance, generator=torch.Generator().manual_seed(0)
-        )
-        depth_m = np.asarray(out.prediction)[0, ..., 0]
+        rig = Rig(sample.K_left, sample.K_right, sample.E)
+        out = call(sample.left, guidance_of(sample.right, rig))
+        depth_m = single_map(out.prediction)
         near, far = depth_range(sample.depth_m)
         error = np.where(
             sample.valid, np.abs(depth_m / np.where(sample.valid, sample.depth_m, 1.0) - 1.0), np.nan

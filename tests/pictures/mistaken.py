@@ -6,30 +6,21 @@ import re
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 from PIL import Image
 
-from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_prior
+from geodiff_plugin import Rig
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
+from geodiff_plugin.evaluation.datasets import StereoSample
 from geodiff_plugin.formats.clouds import in_8_bits
 from geodiff_plugin.formats.out import write_text
+from geodiff_plugin.jobs.report import single_map
 from geodiff_plugin.plotting import colour_depth, depth_range, grid
+from tests.lab.trust import KINDS, Change, moved
 from tests.pictures.gallery import GALLERY_PX, save_webp
-
-
-@dataclass(frozen=True)
-class Given:
-    """What a caller gives: two pictures ``(H, W, 3)`` uint8, K of each in pixels and the pose, metres."""
-
-    left: np.ndarray
-    right: np.ndarray
-    K_left: np.ndarray
-    K_right: np.ndarray
-    E: np.ndarray
+from tests.pictures.rooms import call, guidance_of
 
 
 @dataclass(frozen=True)
@@ -42,67 +33,61 @@ class Outcome:
     said: tuple[tuple[str, str], ...]  # code and sentence
 
 
-def _baseline(given: Given, factor: float) -> Given:
-    E = given.E.copy()
-    E[:3, 3] *= factor
-    return replace(given, E=E)
+def _twice_the_baseline(sample: StereoSample, _: StereoSample) -> StereoSample:
+    return moved(sample, 2.0 * sample.E[:3, 3])
 
 
-def _focal(given: Given, factor: float) -> Given:
-    scale = np.diag((factor, factor, 1.0))
-    return replace(given, K_left=given.K_left @ scale, K_right=given.K_right @ scale)
+def _centre_off(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """The centre of the right image is 10 px from where K says, on the side that brings the scene nearer."""
+    K_right = sample.K_right.copy()
+    K_right[0, 2] += 10.0
+    return replace(sample, K_right=K_right)
 
 
-def _rolled(given: Given, degrees: float) -> Given:
+def _turned(sample: StereoSample, _: StereoSample) -> StereoSample:
     """The right picture turned about its centre, as if its camera had been bent; its pose stays as it was."""
-    turned = Image.fromarray(given.right).rotate(degrees, Image.Resampling.BICUBIC)
-    return replace(given, right=np.asarray(turned))
+    turned = Image.fromarray(sample.right).rotate(3.0, Image.Resampling.BICUBIC)
+    return replace(sample, right=np.asarray(turned))
 
 
-def _offset(given: Given, pixels: float) -> Given:
-    """The centre of the right image is not where K says."""
-    K = given.K_right.copy()
-    K[0, 2] += pixels
-    return replace(given, K_right=K)
+def _upside_down(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """Nothing in the right picture is where the pose would have it, as in one of another place."""
+    return replace(sample, right=sample.right[::-1, ::-1].copy())
 
 
 #: What is given wrongly, and how; the first is right.
-MISTAKES = {
-    "as it is": lambda given: given,
-    "baseline twice as long": lambda given: _baseline(given, 2.0),
-    "baseline in millimetres": lambda given: _baseline(given, 1000.0),
-    "left and right exchanged": lambda given: replace(given, left=given.right, right=given.left),
-    "pose inverted": lambda given: replace(given, E=np.linalg.inv(given.E)),
-    "K of a picture 1.5 times as large": lambda given: _focal(given, 1.5),
-    "centre of the right image off by 10 px": lambda given: _offset(given, 10.0),
-    "right picture turned by 3 degrees": lambda given: _rolled(given, 3.0),
-    "right picture of another place": lambda given: replace(given, right=given.right[::-1, ::-1].copy()),
+MISTAKES: dict[str, Change] = {
+    "as it is": KINDS["right"].change,
+    "baseline twice as long": _twice_the_baseline,
+    "baseline in millimetres": KINDS["millimetres"].change,
+    "left and right exchanged": KINDS["swapped"].change,
+    "pose inverted": KINDS["inverse"].change,
+    "K of a picture 1.5 times as large": KINDS["K-1.5"].change,
+    "centre of the right image off by 10 px": _centre_off,
+    "right picture turned by 3 degrees": _turned,
+    "right picture of another place": _upside_down,
 }
 
 
-def _try(title: str, given: Given, pipe: Any) -> Outcome:
+def _try(title: str, sample: StereoSample) -> Outcome:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the output has them
         try:
-            K = given.K_left, given.K_right
-            guidance = GeometryGuidance(Image.fromarray(given.right), K, given.E)
-            out = pipe(
-                Image.fromarray(given.left), guidance=guidance, generator=torch.Generator().manual_seed(0)
-            )
+            out = call(sample.left, guidance_of(sample.right, Rig(sample.K_left, sample.K_right, sample.E)))
         except InputError as error:
             return Outcome(title, None, "refused", (("", str(error)),))
-    said = {
-        message.code: str(message) for message in (*out.verdict.reasons, *out.warnings, *out.verdict.remarks)
-    }
-    return Outcome(title, np.asarray(out.prediction)[0, ..., 0], out.verdict.status, tuple(said.items()))
+    messages = (*out.verdict.reasons, *out.verdict.remarks, *out.warnings)
+    said = {message.code: str(message) for message in messages if message != out.verdict.message}
+    return Outcome(title, single_map(out.prediction), out.verdict.status, tuple(said.items()))
 
 
 def outcomes() -> list[Outcome]:
     """The demo pair, right and mistaken, with the bundled prior and seed 0."""
-    pair, pipe = read_demo_pair(), enable_geometry_guidance(load_prior("bundled"))
+    pair = read_demo_pair()
     left, right = (in_8_bits(image) for image in (pair.left, pair.right))
-    given = Given(left, right, pair.rig.K_left, pair.rig.K_right, pair.rig.E)
-    return [_try(title, change(given), pipe) for title, change in MISTAKES.items()]
+    cameras = pair.rig.K_left, pair.rig.K_right, pair.rig.E
+    sample = StereoSample("demo", "pair", left, right, *cameras, pair.depth_m, pair.valid)
+    return [_try(title, change(sample, sample)) for title, change in MISTAKES.items()]
 
 
 def _first(text: str) -> str:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,9 @@ import numpy as np
 import torch
 from PIL import Image
 
-from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior
+from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior, read_calibration
 from geodiff_plugin.formats.clouds import flying_points
+from geodiff_plugin.jobs.report import single_map
 
 #: One calibration for all pairs of its folder, as the author of these pictures wrote it.
 CALIBRATION = "stereodemo_calibration.json"
@@ -57,7 +57,6 @@ class RoomResult:
     K: np.ndarray
     baseline_m: float
     status: str
-    reasons: Sequence[str]
 
     @property
     def solid(self) -> np.ndarray:
@@ -71,13 +70,25 @@ def room_named(name: str) -> Room:
 
 
 @lru_cache
-def _prior() -> Any:
+def prior() -> Any:
+    """The bundled prior, with guidance."""
     return enable_geometry_guidance(load_prior("bundled"))
+
+
+def call(left: np.ndarray, guidance: GeometryGuidance | None) -> Any:
+    """The output for a picture ``(H, W, 3)`` uint8, by the bundled prior with seed 0."""
+    generator = torch.Generator().manual_seed(0)
+    return prior()(Image.fromarray(left), guidance=guidance, generator=generator)
+
+
+def guidance_of(right: np.ndarray, rig: Rig) -> GeometryGuidance:
+    """The guidance of a right picture ``(H, W, 3)`` uint8 and a rig in pixels of both pictures."""
+    return GeometryGuidance(Image.fromarray(right), (rig.K_left, rig.K_right), rig.E)
 
 
 def _read(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray, Rig]:
     """Both pictures and their rig, cut to the rectangle that the cameras filled."""
-    told = json.loads((folder / CALIBRATION).read_text())
+    told, rig = json.loads((folder / CALIBRATION).read_text()), read_calibration(folder / CALIBRATION)
     x0, y0, x1, y1 = told["left_image_rect_normalized"]
     columns = slice(round(x0 * told["width"]), round(x1 * told["width"]))
     rows = slice(round(y0 * told["height"]), round(y1 * told["height"]))
@@ -85,28 +96,23 @@ def _read(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray, Rig]:
         np.asarray(Image.open(folder / f"{name}_{side}.png").convert("RGB"))[rows, columns]
         for side in ("left", "right")
     )
-    centres = [(told[key] - columns.start, told["cy"] - rows.start) for key in ("cx0", "cx1")]
-    K_left, K_right = (np.array([[told["fx"], 0, cx], [0, told["fy"], cy], [0, 0, 1]]) for cx, cy in centres)
-    E = np.eye(4)
-    E[0, 3] = told["baseline_meters"]
-    return left, right, Rig(K_left, K_right, E)
+    K_left, K_right = (
+        K - [[0, 0, columns.start], [0, 0, rows.start], [0, 0, 0]] for K in (rig.K_left, rig.K_right)
+    )
+    return left, right, replace(rig, K_left=K_left, K_right=K_right)
 
 
 def solve(folder: Path, room: Room) -> RoomResult:
     """A plain and a guided call on a pair of ``folder``, seed 0."""
     left, right, rig = _read(folder, room.name)
-    picture, pipe = Image.fromarray(left), _prior()
-    guidance = GeometryGuidance(Image.fromarray(right), (rig.K_left, rig.K_right), rig.E)
-    out = pipe(picture, guidance=guidance, generator=torch.Generator().manual_seed(0))
-    plain = pipe(picture, generator=torch.Generator().manual_seed(0))
+    out, plain = call(left, guidance_of(right, rig)), call(left, None)
     return RoomResult(
         left=left,
         right=right,
-        prior=np.asarray(plain.prediction)[0, ..., 0],
-        depth_m=np.asarray(out.prediction)[0, ..., 0],
-        confidence=np.asarray(out.confidence)[0, ..., 0],
+        prior=single_map(plain.prediction),
+        depth_m=single_map(out.prediction),
+        confidence=single_map(out.confidence),
         K=rig.K_left,
         baseline_m=float(np.linalg.norm(rig.E[:3, 3])),
         status=out.verdict.status,
-        reasons=[str(reason) for reason in out.verdict.reasons],
     )

@@ -5,8 +5,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from geodiff_plugin.evaluation.datasets import StereoSample
 from tests.pictures.badges import BADGES, write_badges
-from tests.pictures.mistaken import MISTAKES, Given
+from tests.pictures.mistaken import MISTAKES
 from tests.pictures.moving import measured
 from tests.pictures.orbit import BACKGROUND, look_from, surface_of
 from tests.pictures.rooms import Room, RoomResult
@@ -41,7 +42,7 @@ def test_the_distance_in_the_picture_is_that_of_the_points():
     room = Room("plane", "a plane", "the edge", ((11, 20), (41, 20)))
     image = _checks(np.random.default_rng(1))
     flat = np.full(SIZE, 2.0)
-    result = RoomResult(image, image, flat, flat, np.full(SIZE, 0.95), K, 0.1, "trusted", ())
+    result = RoomResult(image, image, flat, flat, np.full(SIZE, 0.95), K, 0.1, "trusted")
     _, text = measured(result, room)
     assert text.startswith("the edge: 1.00 ± ")  # 30 px at 2 m and 60 px of focal length
 
@@ -59,6 +60,7 @@ def test_a_mistake_changes_what_is_given(title):
     E = np.eye(4)
     E[0, 3] = 0.1
     left, right = (_checks(np.random.default_rng(seed)) for seed in (2, 3))
-    given = Given(left, right, K, K, E)
-    made = MISTAKES[title](given)
+    depth_m = np.full(SIZE, 2.0)
+    given = StereoSample("made", "up", left, right, K, K, E, depth_m, depth_m > 0)
+    made = MISTAKES[title](given, given)
     assert any(not np.array_equal(getattr(made, name), getattr(given, name)) for name in vars(given))
