@@ -51,7 +51,7 @@ def _turned(sample: StereoSample, _: StereoSample) -> StereoSample:
 
 
 def _upside_down(sample: StereoSample, _: StereoSample) -> StereoSample:
-    """Nothing in the right picture is where the pose would have it, as in one of another place."""
+    """The right picture turned by half a turn: nothing is where the pose would have it."""
     return replace(sample, right=sample.right[::-1, ::-1].copy())
 
 
@@ -65,7 +65,7 @@ MISTAKES: dict[str, Change] = {
     "K of a picture 1.5 times as large": KINDS["K-1.5"].change,
     "centre of the right image off by 10 px": _centre_off,
     "right picture turned by 3 degrees": _turned,
-    "right picture of another place": _upside_down,
+    "right picture upside down": _upside_down,
 }
 
 
