@@ -31,7 +31,7 @@ COST_BLOCK = 32, 16
 # Samples of the right images that are interpolated at once: 128 MB.
 _SAMPLES_AT_ONCE = 1 << 25
 # Planes of a path that fit the registers of a warp.
-_PLANES_A_WARP = 512
+_PLANES_A_WARP = 256
 # Sums that a program of the winner holds at once, in registers of its four warps.
 _SUMS_AT_ONCE = 1024
 
