@@ -11,6 +11,7 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import Field, dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number, check_positive, refuse
@@ -18,10 +19,35 @@ from geodiff_plugin._checks import bad_value, check_choice, check_number, check_
 if TYPE_CHECKING:
     from geodiff_plugin.config import GuidanceConfig
 
-# Titles of the groups of options in ``--help``.
+# Titles of the groups of options in ``--help``. Each group fits one screen.
 CAMERAS = "Cameras"
-RUN = "Prior and run"
+SAMPLES = "Data and methods"
 OUTPUT = "Output"
+PRIOR = "Prior"
+GUIDANCE = "Guidance"
+UNKNOWN_POSES = "Photographs without poses"
+FURTHER_VIEWS = "Further views"
+KNOWN_DEPTHS = "Known depths"
+SEQUENCES = "Folders, videos and bags"
+MACHINES = "Many machines"
+SPEED = "Speed on a GPU"
+#: The group of an option that is in none of these, as typer calls it.
+OTHERS = "Options"
+#: The order of the groups: most used first.
+PANELS = (
+    OTHERS,
+    CAMERAS,
+    SAMPLES,
+    OUTPUT,
+    PRIOR,
+    GUIDANCE,
+    UNKNOWN_POSES,
+    FURTHER_VIEWS,
+    KNOWN_DEPTHS,
+    SEQUENCES,
+    MACHINES,
+    SPEED,
+)
 DTYPES = ("float32", "float16", "bfloat16")
 #: Keys of ``scale.space.SPACES``, which cannot be imported without torch; a test keeps them the same.
 SPACES = ("depth", "disparity", "log", "log1p", "sqrt_disparity")
@@ -48,7 +74,7 @@ def declare(
     default: Any,
     help_text: str,
     *flags: str,
-    panel: str = RUN,
+    panel: str = OTHERS,
     low: float | None = None,
     high: float | None = None,
     above_0: str = "",
@@ -96,14 +122,20 @@ def check_options(options: Any, name_of: Callable[[Field[Any]], str] = flag_of) 
 
 def workers_option() -> Any:
     """How many processes of Ray hold the prior."""
-    about = "With --engine ray: processes with the prior (default: as many as fit)."
-    return declare(None, about, low=1, high=10**6, panel=OUTPUT)
+    about = "With --engine ray: processes that hold the prior (default: as many as fit)."
+    return declare(None, about, low=1, high=10**6, panel=MACHINES)
 
 
 def gpus_option() -> Any:
     """GPUs of each process of Ray."""
     about = "With --engine ray: GPUs of each process, also a fraction (default: 1 where there are any)."
-    return declare(None, about, low=0, high=64, panel=OUTPUT)
+    return declare(None, about, low=0, high=64, panel=MACHINES)
+
+
+def engine_option() -> Any:
+    """What works on many items."""
+    about = "local (this machine) or ray (Ray Data, on one machine or a cluster; extra 'ray')."
+    return declare("local", about, choices=ENGINES, panel=MACHINES)
 
 
 def check_engine(options: Any) -> None:
@@ -115,23 +147,26 @@ def check_engine(options: Any) -> None:
             refuse(f"--{name} needs --engine ray.")
 
 
+_prior, _guidance = partial(declare, panel=PRIOR), partial(declare, panel=GUIDANCE)
+
+
 @dataclass(frozen=True, kw_only=True)
 class PriorOptions:
     """Which prior runs, and where: what every command that runs one has in common."""
 
-    prior: str = declare(
+    prior: str = _prior(
         "bundled", "The prior: 'bundled', a hub id or a folder; KEY:FOLDER names the adapter of a folder."
     )
-    space: str | None = declare(
+    space: str | None = _prior(
         None,
         f"What the prior's map is affine in, where its folder does not say: {', '.join(SPACES)}.",
         choices=SPACES,
     )
-    steps: int | None = declare(
+    steps: int | None = _prior(
         None, "Denoising steps (default: the prior's own number, at least 4).", low=1, high=1000
     )
-    seed: int = declare(0, "Seed of the noise.", low=0, high=2**63 - 1)
-    device: str = declare("auto", "Where it runs: auto, cpu, cuda, cuda:N or mps.")
+    seed: int = _prior(0, "Seed of the noise.", low=0, high=2**63 - 1)
+    device: str = _prior("auto", "Where it runs: auto, cpu, cuda, cuda:N or mps.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,41 +175,43 @@ class SpeedOptions:
 
     graphs: bool = declare(
         False,
-        "Networks as CUDA graphs, and a faster group norm in half precision (on for many pairs, captures).",
+        "Run the networks as CUDA graphs, with a faster group norm in half precision (for many pairs and "
+        "captures this is done anyway).",
+        panel=SPEED,
     )
-    no_kernels: bool = declare(False, "No Triton kernels: every stage in plain torch.")
+    no_kernels: bool = declare(False, "Run every stage in plain torch, without Triton kernels.", panel=SPEED)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(PriorOptions):
     """How it runs: what ``geodiff depth``, the page and the ComfyUI node have in common."""
 
-    option: tuple[str, ...] = declare(
+    option: tuple[str, ...] = _prior(
         (), "An option of the prior as NAME=VALUE, such as domain=outdoor of GeoWizard; repeatable."
     )
-    ensemble: int = declare(
+    ensemble: int = _prior(
         1,
         "Number of runs with different noise; the spread of two or more is the uncertainty.",
         low=1,
         high=1000,
     )
-    resolution: int | None = declare(
+    resolution: int | None = _prior(
         None,
         "Longer side of the image for the prior, in pixels; 0 keeps its size (default: the prior's own).",
         low=0,
         high=8192,
     )
-    near: float | None = declare(None, "Nearest depth to search, in metres.", above_0="metres")
-    far: float | None = declare(None, "Farthest depth to search, in metres.", above_0="metres")
-    dtype: str = declare(
+    near: float | None = _guidance(None, "Nearest depth to search, in metres.", above_0="metres")
+    far: float | None = _guidance(None, "Farthest depth to search, in metres.", above_0="metres")
+    dtype: str = _prior(
         "float32", "Number format of the prior: float32, float16 or bfloat16.", choices=DTYPES
     )
-    preset: str = declare(
+    preset: str = _guidance(
         "default",
         "default, fast (coarser matches, poses as given) or paper (Algorithm 1).",
         choices=PRESETS,
     )
-    knob: tuple[str, ...] = declare(
+    knob: tuple[str, ...] = _guidance(
         (), "A knob of the guidance, such as inner_steps=0; repeatable. geodiff info --knobs lists them."
     )
 

@@ -122,7 +122,7 @@ class _Info:
 @dataclass(frozen=True, kw_only=True)
 class _Video:
     frames: tuple[Path, ...] = declare(
-        MISSING, "Folders of geodiff depth, or depth maps as .npy, in order.", "", metavar="FRAME..."
+        MISSING, "Folders of geodiff depth, or depth maps as .npy, in order.", "", metavar="FRAME"
     )
     out: Path = _out(Path("depth.webp"), "The video: .mp4, .webp or .gif.", "--out", "-o")
     fps: float = declare(10.0, "Frames per second.")
@@ -133,7 +133,7 @@ class _Video:
 
 @dataclass(frozen=True, kw_only=True)
 class _Submit:
-    results: tuple[Path, ...] = declare(MISSING, "Folders that geodiff depth wrote.", "", metavar="RESULT...")
+    results: tuple[Path, ...] = declare(MISSING, "Folders that geodiff depth wrote.", "", metavar="RESULT")
     to: str = declare(MISSING, "Benchmark: middlebury or eth3d.", choices=("middlebury", "eth3d"))
     out: Path = _out(MISSING, "Output folder.", "--out", "-o")
     method: str = declare("GeoDiff", "Name of the method in the files of Middlebury.")
@@ -160,10 +160,11 @@ class _Page:
 class _Convert:
     paths: tuple[Path, ...] = declare(
         MISSING,
-        "SRC is a checkpoint (.ckpt, .pth) or a folder of .bin weights. For Marigold V2 BASE is a folder of "
-        "Qwen-Image-Edit-2509 and CHECKPOINT its trainables.safetensors. DST is the new folder, for --prior.",
+        "SRC DST: a checkpoint (.ckpt, .pth) or a folder of .bin weights, and the new folder for --prior. Or "
+        "marigold-v2 BASE CHECKPOINT DST: a folder of Qwen-Image-Edit-2509, the trainables.safetensors of "
+        "Marigold V2, and the new folder.",
         "",
-        metavar="SRC DST | marigold-v2 BASE CHECKPOINT DST",
+        metavar="PATH",
     )
     part: str | None = declare(
         None, "What SRC lacks: a file, folder or hub id (docs/reference/priors.md).", "--with"
@@ -172,9 +173,16 @@ class _Convert:
 
 
 COMMANDS = {
-    "depth": Command(DepthOptions, _depth, "Metric depth of LEFT, guided by RIGHT: one pair, or many."),
-    "capture": Command(CaptureOptions, _capture, "Metric depth of the frames of a capture, and one cloud."),
-    "demo": Command(_Demo, _Demo.run, "Run on the bundled pair, whose depth is known, or on real ones."),
+    "depth": Command(
+        DepthOptions,
+        _depth,
+        "Metric depth of LEFT, guided by RIGHT: one pair, or many.\n\n"
+        "For example: geodiff depth left.png right.png --calib calib.txt",
+    ),
+    "capture": Command(
+        CaptureOptions, _capture, "Metric depth of the frames of a capture, and one point cloud."
+    ),
+    "demo": Command(_Demo, _Demo.run, "Run on the bundled pair, whose depth is known, or on real pairs."),
     "info": Command(_Info, _later("cli.info.run_info"), "Show versions, devices and priors."),
     "bench": Command(
         _Bench,
@@ -184,9 +192,17 @@ COMMANDS = {
     "video": Command(_Video, _later("cli.results.run_video"), "Join the depth maps of frames into a video."),
     "merge": Command(_Merge, _later("cli.results.run_merge"), "Join the tables of shards of many pairs."),
     "submit": Command(_Submit, _later("cli.results.run_submit"), "Write results for Middlebury or ETH3D."),
-    "app": Command(_Page, _later("app.launch.run_app"), "Serve a page for measuring (extra 'app')."),
-    "convert": Command(_Convert, _later("cli.results.run_convert"), "Make a folder for --prior of weights."),
-    "eval": Command(None, lambda _: _imported("cli.eval.eval_app"), "Evaluate it and others on data sets."),
+    "app": Command(
+        _Page, _later("app.launch.run_app"), "Serve the page that measures in the browser (extra 'app')."
+    ),
+    "convert": Command(
+        _Convert, _later("cli.results.run_convert"), "Turn downloaded weights into a folder for --prior."
+    ),
+    "eval": Command(
+        None,
+        lambda _: _imported("cli.eval.eval_app"),
+        "Evaluate this package and other methods on data sets.",
+    ),
 }
 ABOUT = "Depth in metres from two photographs and their cameras, with any Marigold-style diffusion prior."
 app = new_group(ABOUT, COMMANDS, outermost=True)

@@ -11,14 +11,14 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 import typer.main
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.cli.terminal import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED
 from geodiff_plugin.jobs.memory import CURE, is_out_of_memory
 from geodiff_plugin.jobs.stopping import Terminated, ending_on_sigterm
 from geodiff_plugin.jobs.telling import say
-from geodiff_plugin.options import CAMERAS, OUTPUT, RUN, Command, check_options, flag_of
+from geodiff_plugin.options import OTHERS, OUTPUT, PANELS, Command, check_options, flag_of
 
 APPEARANCE: dict[str, Any] = {
     "add_completion": False,
@@ -62,6 +62,15 @@ class _OutermostGroup(_Group):
             sys.exit(EXIT_BAD_INPUT)
 
 
+class _Single(TyperCommand):
+    def get_help_option(self, ctx: Any) -> Any:
+        """``--help``, among the options of output instead of in a group of its own."""
+        option = super().get_help_option(ctx)
+        panels = {getattr(each, "rich_help_panel", None) for each in self.params}
+        vars(option).update(metavar="", rich_help_panel=OUTPUT if OUTPUT in panels else OTHERS)
+        return option
+
+
 def new_group(help_text: str, commands: Mapping[str, Command], outermost: bool = False) -> typer.Typer:
     """A group of commands by their names; errors are told by the outermost one."""
     kind = type("Group", (_OutermostGroup if outermost else _Group,), {"table": commands})
@@ -74,9 +83,9 @@ def new_group(help_text: str, commands: Mapping[str, Command], outermost: bool =
 def _built(name: str, command: Command) -> Any:
     if command.options is None:
         return typer.main.get_command(command.run(None))
-    options, kinds, panels = command.options, get_type_hints(command.options), [CAMERAS, RUN, OUTPUT]
+    options, kinds = command.options, get_type_hints(command.options)
     known = [field for field in dataclasses.fields(options) if field.metadata]
-    known.sort(key=lambda f: (flag_of(f)[0] == "-", panels.index(f.metadata["panel"])))
+    known.sort(key=lambda f: (flag_of(f)[0] == "-", PANELS.index(f.metadata["panel"])))
 
     def call(**typed: Any) -> None:
         made = options(**{f.name: _value(f, typed[f.name], kinds[f.name]) for f in known})
@@ -85,7 +94,7 @@ def _built(name: str, command: Command) -> Any:
 
     vars(call)["__signature__"] = Signature([_parameter(field, kinds[field.name]) for field in known])
     single = typer.Typer(**APPEARANCE)
-    single.command(name, help=command.about)(call)
+    single.command(name, cls=_Single, help=command.about)(call)
     return typer.main.get_command(single)
 
 
@@ -93,7 +102,9 @@ def _parameter(field: dataclasses.Field[Any], kind: Any) -> Parameter:
     """An option or argument of typer for a field of a dataclass of options."""
     rules, required = field.metadata, field.default is dataclasses.MISSING
     default: Any = field.default
+    shown: str | bool = True
     if rules["split"]:
+        shown = ", ".join(map(str, default)) or True  # lines of help break at blanks alone
         kind, default = str | None, ",".join(map(str, default)) or None
     elif get_origin(kind) is tuple:
         kind = list[get_args(kind)[0]]  # type: ignore[misc]
@@ -103,7 +114,7 @@ def _parameter(field: dataclasses.Field[Any], kind: Any) -> Parameter:
     if flags == ("",):
         typed: Any = typer.Argument(**about)
     else:
-        typed = typer.Option(*flags, **about, rich_help_panel=rules["panel"] or None)
+        typed = typer.Option(*flags, **about, rich_help_panel=rules["panel"], show_default=shown)
     default = Parameter.empty if required else default
     return Parameter(field.name, Parameter.KEYWORD_ONLY, annotation=Annotated[kind, typed], default=default)
 

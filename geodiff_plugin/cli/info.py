@@ -49,6 +49,15 @@ def _describe(source: PriorSource, space: str | None) -> list[tuple[str, str]]:
     ]
 
 
+def _cached_models() -> list[str]:
+    """Models that the hub's cache holds, with their sizes."""
+    try:
+        models = [repo for repo in scan_cache_dir().repos if repo.repo_type == "model"]
+    except CacheNotFound:
+        return []
+    return sorted(f"{repo.repo_id} ({repo.size_on_disk / 1e6:.1f} MB)" for repo in models)
+
+
 def run_info(prior: str | None, space: str | None, knobs: bool) -> None:
     """Print it, with what a prior is, or the knobs instead."""
     if knobs:
@@ -67,12 +76,7 @@ def run_info(prior: str | None, space: str | None, knobs: bool) -> None:
         rows.append(("device", f"cuda:{index} ({device.name}, {device.total_memory / 2**30:.0f} GiB)"))
     rows += [("device", "mps")] if torch.backends.mps.is_available() else []
     rows.append(("kernels", kernels_in_use()))
-    try:
-        models = [repo for repo in scan_cache_dir().repos if repo.repo_type == "model"]
-    except CacheNotFound:
-        models = []
-    cached = sorted(f"{repo.repo_id} ({repo.size_on_disk / 1e6:.1f} MB)" for repo in models)
     first, *others = wrap(", ".join(PRIORS), LINE_WIDTH)
     rows += [("adapters", first), *(("", line) for line in others)]
-    rows += [("cached", line) for line in cached or ["nothing"]]
+    rows += [("cached", line) for line in _cached_models() or ["nothing"]]
     print_lines([*rows, ("package", str(Path(__file__).resolve().parents[1])), *described])

@@ -11,14 +11,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from geodiff_plugin.options import (
     DTYPES,
-    ENGINES,
+    OTHERS,
     OUTPUT,
+    PRIOR,
+    SAMPLES,
     Command,
     PriorOptions,
     SpeedOptions,
     check_engine,
     check_options,
     declare,
+    engine_option,
     flag_of,
     gpus_option,
     imported,
@@ -58,7 +61,7 @@ def out_folder(folder: str) -> Any:
 
 def listed(default: tuple[Any, ...], help_text: str, **rules: Any) -> Any:
     """A tuple that is typed with commas."""
-    return declare(default, help_text, split=True, **rules)
+    return declare(default, help_text, split=True, **{"panel": SAMPLES, **rules})
 
 
 def some_of(names: Collection[str]) -> Any:
@@ -66,22 +69,26 @@ def some_of(names: Collection[str]) -> Any:
     return listed(tuple(names), f"Which of {', '.join(names)}, separated by commas.", choices=names)
 
 
-def count_of(default: int | None, help_text: str, low: int = 1, high: int = 10**9) -> Any:
+def count_of(
+    default: int | None, help_text: str, low: int = 1, high: int = 10**9, panel: str = SAMPLES
+) -> Any:
     """A whole number in [low, high]."""
-    return declare(default, help_text, low=low, high=high)
+    return declare(default, help_text, low=low, high=high, panel=panel)
 
 
 def folder_of(help_text: str, *flags: str, default: Any = None) -> Any:
     """A folder, or a registered data set such as the renderer's."""
-    return declare(default, help_text, *flags, metavar="DIR")
+    return declare(default, help_text, *flags, metavar="DIR", panel=SAMPLES)
 
 
 @dataclass(frozen=True, kw_only=True)
 class OutOptions:
     """What every command is told."""
 
-    seed: int = declare(0, "Seed of the noise.")
-    steps: int | None = count_of(None, "Denoising steps (default: each method's own).", high=1000)
+    seed: int = declare(0, "Seed of the noise.", panel=PRIOR)
+    steps: int | None = count_of(
+        None, "Denoising steps (default: each method's own).", high=1000, panel=PRIOR
+    )
     out: Path = out_folder("geodiff-eval")
     results: Path | None = declare(None, "Also write the page as Markdown to this file.", panel=OUTPUT)
     quiet: bool = declare(False, "Show no progress bar and no result.", "--quiet", "-q", panel=OUTPUT)
@@ -104,7 +111,9 @@ class OutOptions:
 class EvalOptions(SpeedOptions, OutOptions, PriorOptions):
     """What every command that runs a prior is told."""
 
-    dtype: str = declare("float32", f"Number format of the prior: {', '.join(DTYPES)}.", choices=DTYPES)
+    dtype: str = declare(
+        "float32", f"Number format of the prior: {', '.join(DTYPES)}.", choices=DTYPES, panel=PRIOR
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,13 +131,16 @@ class SampleOptions(EvalOptions):
     limit: int | None = count_of(
         None, "Number of samples taken, from the first; in a table of the paper, of each data set."
     )
-    ensemble: int = count_of(1, "Members of the ensemble.", high=1000)
-    resolution: int | None = count_of(None, "Longer side of the image for the prior, in pixels.", 0, 8192)
+    ensemble: int = count_of(1, "Members of the ensemble.", high=1000, panel=PRIOR)
+    resolution: int | None = count_of(
+        None, "Longer side of the image for the prior, in pixels.", 0, 8192, PRIOR
+    )
     views: int = count_of(2, "Number of views taken of a scene that has more than two.", 2, 100)
     perturb: str | None = declare(
         None,
         "Make the poses wrong, by a turn in degrees and a shift as a share of the baseline.",
         metavar="DEGREES,SHARE",
+        panel=SAMPLES,
     )
 
 
@@ -138,10 +150,15 @@ class PairsOptions(SampleOptions):
 
     sample: int | None = count_of(None, "Number of samples drawn at random, by --seed.")
     pairs: str = declare(
-        "default", "Pairs of posed views: default (two a scene) or all.", choices=("default", "all")
+        "default",
+        "Pairs of posed views: default (two a scene) or all.",
+        choices=("default", "all"),
+        panel=SAMPLES,
     )
     pixel_centre: float | None = declare(
-        None, "Coordinate of the first pixel's centre in posed cameras: 0, or 0.5 as COLMAP has it."
+        None,
+        "Coordinate of the first pixel's centre in posed cameras: 0, or 0.5 as COLMAP has it.",
+        panel=SAMPLES,
     )
     stop_on_broken: bool = declare(
         False, "End at the first broken sample, instead of leaving it out and saying so.", panel=OUTPUT
@@ -161,7 +178,7 @@ class PaperOptions(PairsOptions):
     """The tables of the paper, as the paper made them."""
 
     ensemble: int = count_of(
-        PAPER_ENSEMBLE, "Members of the ensemble (default: the paper's number).", high=1000
+        PAPER_ENSEMBLE, "Members of the ensemble (default: the paper's number).", high=1000, panel=PRIOR
     )
 
 
@@ -173,7 +190,7 @@ class DirOptions(PairsOptions):
         "Folder of data sets, or the name of a registered set.", "", default=MISSING
     )
     methods: tuple[str, ...] = listed(PEERS, "Methods, separated by commas; geodiff eval list names them.")
-    engine: str = declare("local", "local, or ray (a cluster, extra 'ray').", choices=ENGINES, panel=OUTPUT)
+    engine: str = engine_option()
     workers: int | None = workers_option()
     gpus: float | None = gpus_option()
 
@@ -191,6 +208,7 @@ class FigureOptions(SampleOptions):
     updates: tuple[int, ...] = listed(
         (1, 2, 5, 10, 20, 40),
         "inner-steps: numbers of updates per step, separated by commas.",
+        panel=OTHERS,
         low=1,
         high=10**4,
     )
@@ -215,7 +233,9 @@ class PosesOptions(EvalOptions):
         "How wrong, of rectified pairs: turn and shift of the right image.",
         metavar="DEGREES,PIXELS",
     )
-    resolution: int | None = count_of(None, "Longer side of the image for the prior, in pixels.", 0, 8192)
+    resolution: int | None = count_of(
+        None, "Longer side of the image for the prior, in pixels.", 0, 8192, PRIOR
+    )
     out: Path = out_folder("geodiff-poses")
 
 
@@ -224,7 +244,7 @@ class CaptureEvalOptions(EvalOptions):
     """``geodiff eval capture DIR ...``."""
 
     data: tuple[Path, ...] = folder_of("Captures that name depth maps of their frames.", "", default=MISSING)
-    frames: str | None = declare(None, "Frames, NAME,NAME or FIRST:LAST:STEP (default: all).")
+    frames: str | None = declare(None, "Frames, NAME,NAME or FIRST:LAST:STEP (default: all).", panel=SAMPLES)
     count: int | None = count_of(
         None, "Number of frames of each capture, evenly spread, instead of --frames.", 2
     )

@@ -16,14 +16,20 @@ from geodiff_plugin.formats.files import check_file, open_image
 from geodiff_plugin.formats.out import OutFolder, free_folder
 from geodiff_plugin.options import (
     CAMERAS,
-    ENGINES,
+    FURTHER_VIEWS,
+    KNOWN_DEPTHS,
+    MACHINES,
     OUTPUT,
+    PRIOR,
+    SEQUENCES,
+    UNKNOWN_POSES,
     PriorOptions,
     RunOptions,
     SpeedOptions,
     check_engine,
     check_options,
     declare,
+    engine_option,
     flag_of,
     gpus_option,
     workers_option,
@@ -32,6 +38,9 @@ from geodiff_plugin.options import (
 #: What is read of a COLMAP model, the one kind of calibration that is a folder.
 MODEL_FILES = ("cameras.txt", "images.txt")
 _camera, _output = partial(declare, panel=CAMERAS), partial(declare, panel=OUTPUT)
+_prior, _known = partial(declare, panel=PRIOR), partial(declare, panel=KNOWN_DEPTHS)
+_unposed, _further = partial(declare, panel=UNKNOWN_POSES), partial(declare, panel=FURTHER_VIEWS)
+_sequence, _machines = partial(declare, panel=SEQUENCES), partial(declare, panel=MACHINES)
 PARAMETERS = ("fx", "fy", "cx", "cy", "baseline")
 #: Those that nothing stands in for.
 NEEDED_PARAMETERS = ("fx", "baseline")
@@ -93,13 +102,13 @@ class DepthOptions(SpeedOptions, RunOptions):
         (), "Calibration file or COLMAP folder; repeat it for one file per view."
     )
     cameras: str | None = _camera(None, "Two cameras of a calibration file that has more, left first: 2,3.")
+    baseline: float | None = _camera(
+        None, "Distance between the cameras in metres; replaces that of --calib.", above_0="metres"
+    )
     fx: float | None = _camera(None, "Focal length along x in pixels.")
     fy: float | None = _camera(None, "Focal length along y in pixels (default: --fx).")
     cx: float | None = _camera(None, "Principal point in pixels from the left edge (default: the middle).")
     cy: float | None = _camera(None, "Principal point in pixels from the top edge (default: the middle).")
-    baseline: float | None = _camera(
-        None, "Distance between the cameras in metres; replaces that of --calib.", above_0="metres"
-    )
     cx_right: float | None = _camera(
         None, "cx of the right camera of a rectified pair, where it differs from --cx."
     )
@@ -115,56 +124,48 @@ class DepthOptions(SpeedOptions, RunOptions):
         "Lens distortion: k1,k2,p1,p2[,k3...] or fisheye:k1,k2,k3,k4; repeat it where the right lens "
         "differs.",
     )
-    estimate_pose: bool = _camera(False, "Estimate the poses from the photographs (needs the extra 'pose').")
-    fov: float | None = _camera(None, "Horizontal field of view in degrees, where EXIF has no focal length.")
-    known_length: str | None = _camera(
+    cropped: bool = _camera(False, "Allow a principal point outside the image, as crops may have.")
+    estimate_pose: bool = _unposed(False, "Estimate the poses from the photographs (needs the extra 'pose').")
+    fov: float | None = _unposed(None, "Horizontal field of view in degrees, where EXIF has no focal length.")
+    known_length: str | None = _unposed(
         None,
         "Instead of --baseline: two pixels of LEFT and the distance between the places that they show, as "
         "X1,Y1,X2,Y2,METRES.",
     )
-    view: tuple[Path, ...] = _camera((), "A further view of the scene, with its --view-E; repeat both.")
-    view_k: tuple[Path, ...] = _camera((), "Intrinsics of each --view (default: those of LEFT).", "--view-K")
-    view_e: tuple[Path, ...] = _camera(
+    view: tuple[Path, ...] = _further((), "A further view of the scene, with its --view-E; repeat both.")
+    view_k: tuple[Path, ...] = _further((), "Intrinsics of each --view (default: those of LEFT).", "--view-K")
+    view_e: tuple[Path, ...] = _further(
         (), "Pose of each --view in the left camera's frame: a 4x4 matrix in metres.", "--view-E"
     )
-    view_distortion: tuple[str, ...] = _camera(
+    view_distortion: tuple[str, ...] = _further(
         (), "Lens distortion of each --view; 0,0,0,0 for none (default: that of LEFT)."
     )
-    side_by_side: bool = declare(False, "LEFT is one picture with both views, the left one on the left.")
-    cropped: bool = _camera(False, "Allow a principal point outside the image, as crops may have.")
-    prior_map: Path | None = declare(
+    prior_map: Path | None = _prior(
         None, "Take another model's depth map of LEFT, or a folder of maps, as the prior."
     )
-    points: Path | None = declare(
+    points: Path | None = _known(
         None, "Known depths in metres: a depth map of LEFT, or points (.npy, text, .ply)."
     )
-    points_scale: float | None = declare(
+    points_scale: float | None = _known(
         None, "Units per metre of --points (1000: millimetres), or per pixel of --disparity.", above_0="units"
     )
-    disparity: Path | None = declare(
+    disparity: Path | None = _known(
         None, "Known disparities of LEFT in a rectified rig, instead of --points."
     )
-    points_confidence: Path | None = declare(
+    points_confidence: Path | None = _known(
         None, "Confidence of each known depth, 0 to 1, as an array of the same shape."
     )
-    topic_left: str | None = declare(None, "In a bag: the topic of the left images.", "--left")
-    topic_right: str | None = declare(None, "In a bag: the topic of the right images.", "--right")
-    tolerance: float = declare(
+    side_by_side: bool = _sequence(False, "LEFT is one picture or video with both views, left one first.")
+    steady: bool = _sequence(False, "Average the depth of consecutive frames where they agree.")
+    topic_left: str | None = _sequence(None, "In a bag: the topic of the left images.", "--left")
+    topic_right: str | None = _sequence(None, "In a bag: the topic of the right images.", "--right")
+    tolerance: float = _sequence(
         0.005, "In a bag: the largest time between the two images of a pair, in seconds.", low=0.0, high=10.0
     )
-    encoding: str = _output(
+    encoding: str = _sequence(
         "16UC1",
         "In a bag: depth as 16UC1 (whole millimetres) or 32FC1 (metres).",
         choices=("16UC1", "32FC1"),
-    )
-    steady: bool = _output(False, "Average the depth of consecutive frames where they agree.")
-    min_confidence: float = _output(
-        0.0, "Leave points of lower confidence out of the cloud, 0 to 1.", low=0, high=1
-    )
-    into: Path | None = _output(
-        None,
-        "Also write the depth as another camera sees it: a JSON file with its K, its pose E in the left "
-        "camera's frame, width and height.",
     )
     out: Path | None = _output(
         None, "Output folder (default: geodiff-out, with a number if that exists).", "--out", "-o"
@@ -172,25 +173,31 @@ class DepthOptions(SpeedOptions, RunOptions):
     overwrite: bool = _output(
         False, "Write into a folder that holds files, and compute finished pairs again."
     )
-    strict: bool = _output(False, "Fail unless the result is trusted.")
     export: tuple[str, ...] = _output(
         (),
         "Also write glb (point cloud), mesh (textured GLB) or colmap (sparse model); repeatable.",
         choices=("glb", "mesh", "colmap"),
     )
-    engine: str = _output(
-        "local", "Of many pairs: local, or ray (Ray Data on a cluster, extra 'ray').", choices=ENGINES
+    min_confidence: float = _output(
+        0.0, "Leave points of lower confidence out of the cloud, 0 to 1.", low=0, high=1
     )
-    layout: str | None = _output(
-        None, "With --engine ray: parquet (default) or folders, as without it.", "--as", choices=LAYOUTS
+    into: Path | None = _output(
+        None,
+        "Also write the depth that another camera sees. A JSON file gives its K, its pose E in the left "
+        "camera's frame, width and height.",
+    )
+    strict: bool = _output(False, "Fail unless the result is trusted.")
+    quiet: bool = _output(False, "Show no progress bar and no summary.", "--quiet", "-q")
+    json: bool = _output(False, "Print the report as JSON instead of the summary.")
+    shard: str | None = _machines(
+        None, "Do part I of N of the pairs, counted from 0/N; geodiff merge joins the tables.", metavar="I/N"
+    )
+    engine: str = engine_option()
+    layout: str | None = _machines(
+        None, "What Ray writes: parquet (default) or folders, as without Ray.", "--as", choices=LAYOUTS
     )
     workers: int | None = workers_option()
     gpus: float | None = gpus_option()
-    shard: str | None = _output(
-        None, "Of many pairs: do part I of N, from 0/N on; geodiff merge joins the tables.", metavar="I/N"
-    )
-    quiet: bool = _output(False, "Show no progress bar and no summary.", "--quiet", "-q")
-    json: bool = _output(False, "Print the report as JSON instead of the summary.")
 
     def __post_init__(self) -> None:
         if self.prior_map is not None and self.prior == "bundled":  # the default, which the map replaces
@@ -437,18 +444,8 @@ class CaptureOptions(SpeedOptions, PriorOptions):
     trajectory: Path | None = _camera(
         None, "Poses of a video in TUM's form: 'seconds tx ty tz qx qy qz qw' on each line."
     )
-    prior_map: Path | None = declare(
+    prior_map: Path | None = _prior(
         None, "Take another model's depth maps as the prior: a folder with NAME.npy for each frame."
-    )
-    processes: int | None = declare(None, "Number of processes (default: one per core).", low=1, high=1024)
-    engine: str = _output("local", "local, or ray (a cluster, extra 'ray').", choices=ENGINES)
-    workers: int | None = workers_option()
-    gpus: float | None = gpus_option()
-    poses_only: bool = _output(False, "Only solve the poses; runs with --shard then start from them.")
-    shard: str | None = _output(
-        None,
-        "Do part I of N of the frames, from 0/N on; the same command without it then joins them.",
-        metavar="I/N",
     )
     export: tuple[str, ...] = _output(
         (),
@@ -456,12 +453,22 @@ class CaptureOptions(SpeedOptions, PriorOptions):
         "(TSDF fusion, needs Open3D); repeatable.",
         choices=("colmap", "mesh", "nerfstudio"),
     )
+    poses_only: bool = _output(False, "Only solve the poses; runs with --shard then start from them.")
     overwrite: bool = _output(
         False, "Write into a folder that holds files, and compute finished frames again."
     )
     strict: bool = _output(False, "End with exit code 4 unless every frame is trusted.")
     quiet: bool = _output(False, "Show no progress bar.", "--quiet", "-q")
     json: bool = _output(False, "Print the report as JSON instead of the summary.")
+    processes: int | None = _machines(None, "Number of processes (default: one per core).", low=1, high=1024)
+    shard: str | None = _machines(
+        None,
+        "Do part I of N of the frames, counted from 0/N; the same command without it then joins them.",
+        metavar="I/N",
+    )
+    engine: str = engine_option()
+    workers: int | None = workers_option()
+    gpus: float | None = gpus_option()
 
     def __post_init__(self) -> None:
         check_options(self)
