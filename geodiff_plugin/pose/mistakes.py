@@ -153,7 +153,10 @@ def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> Message | N
     ``T (4, 4)`` is ``T_right_from_left`` as given, ``near`` the pose near it that fits best: where only
     that fits, the pose is inexact.
     """
-    given, nearby = _fit(tracks, T), _fit(tracks, near)
+    given = _fit(tracks, T)
+    if all(_CLEARLY * share >= 1.0 for share in given.shares):  # no share is more than 1
+        return None
+    nearby = _fit(tracks, near)
     mistake, fit, far = _likeliest(tracks, T)
     if any(share <= _NEARLY * other for share, other in zip(fit.shares, nearby.shares, strict=True)):
         return None
