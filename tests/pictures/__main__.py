@@ -2,6 +2,7 @@
 
 python -m tests.pictures rooms --data FOLDER
 python -m tests.pictures mistaken
+python -m tests.pictures charts
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import typer
 
 from geodiff_plugin.cli.commands import APPEARANCE
 from tests.pictures.badges import write_badges
+from tests.pictures.charts import write_charts
 from tests.pictures.gallery import write_rendered, write_room, write_slider, write_tiles
 from tests.pictures.mistaken import write_mistaken
 from tests.pictures.moving import write_moving
@@ -54,6 +56,15 @@ def mistaken(
 ) -> None:
     """The page about one pair that is given with usual mistakes, and its picture."""
     write_mistaken(page, images, "python -m tests.pictures mistaken")
+
+
+@app.command()
+def charts(
+    pages: Annotated[Path, typer.Option(help="Folder of the pages with tables.")] = Path("docs/reference"),
+    images: Images = IMAGES,
+) -> None:
+    """A bar chart above every table of results, made from the table."""
+    write_charts(pages, images)
 
 
 @app.command()
