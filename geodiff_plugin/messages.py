@@ -532,6 +532,13 @@ MESSAGES: dict[str, MessageKind] = {
         cure="Give a known length (--known-length) or a distance (--distance).",
         forbids_trust=True,
     ),
+    "capture.length": MessageKind(
+        "The known length is not measured well in its frame",
+        cause="An end of --known-length lies where the depth of the frame is uncertain: without texture, on "
+        "an edge, or seen by no other frame.",
+        cure="Choose other ends, or give a distance (--distance).",
+        forbids_trust=True,
+    ),
     "capture.wrong-poses": MessageKind(
         "Given poses of some frames are wrong",
         cause="The tracker jumped.",

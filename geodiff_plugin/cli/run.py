@@ -17,6 +17,7 @@ from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.jobs.bag import depth_bag
 from geodiff_plugin.jobs.capture import depth_capture
 from geodiff_plugin.jobs.finished import Row
+from geodiff_plugin.jobs.lengths import measured_words
 from geodiff_plugin.jobs.many import depth_pairs
 from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions
 from geodiff_plugin.jobs.pair import depth_pair
@@ -123,6 +124,8 @@ def run_capture(options: CaptureOptions) -> None:
         print(f"poses {report['poses']['status']} -> {options.out}/")
     else:
         print(summary(report, options.out))
+        for record in report.get("measured", ()):
+            print(measured_words(record))
     if report["failed"] or (options.strict and report["not_trusted"]):
         sys.exit(EXIT_SOME_FAILED)
 

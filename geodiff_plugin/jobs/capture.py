@@ -19,7 +19,7 @@ import psutil  # comes with accelerate
 import torch
 
 from geodiff_plugin import __version__
-from geodiff_plugin._checks import InputError, bad_value, check_positive, refuse, warn
+from geodiff_plugin._checks import InputError, bad_value, refuse, warn
 from geodiff_plugin._threads import WithinCores, available_cores
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.capture.results import ALONE, save_alone, write_agreement, write_results
@@ -28,6 +28,7 @@ from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
 from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, check_new, working_in, write_text
 from geodiff_plugin.jobs.failures import Failures
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Record, Shard, shards_beside
+from geodiff_plugin.jobs.lengths import KnownScale, check_lengths, known_scale, measure, spans_to_measure
 from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import OF_SCALE, CaptureOptions
 from geodiff_plugin.jobs.prior import graphs_for_many, load_guided_prior
@@ -56,11 +57,11 @@ FEWER_PROCESSES = ", or give a lower --processes"
 
 @dataclass(frozen=True)
 class RunKeys:
-    """What a helping process needs beside the options: keys of poses and frames, metres per unit."""
+    """What a helping process needs beside the options: keys of poses and frames, and the scale."""
 
     poses_key: str
     frames_key: str
-    factor: float | None
+    scale: KnownScale | None
 
 
 def open_capture(options: CaptureOptions) -> Capture:
@@ -72,16 +73,16 @@ def open_capture(options: CaptureOptions) -> Capture:
     if "mesh" in options.export and find_spec("open3d") is None:
         bad_value("--export mesh", "used where Open3D is installed", "none", "pip install open3d")
     capture.check_points(options.points, any(getattr(options, way) is not None for way in OF_SCALE))
-    _length(capture, options)
+    check_lengths(capture, options)
     return capture
 
 
 def solved_poses(
-    capture: Capture, options: CaptureOptions, key: str, factor: float | None = None
-) -> float | None:
+    capture: Capture, options: CaptureOptions, key: str, scale: KnownScale | None = None
+) -> KnownScale | None:
     """Solve for the poses, or load those of an earlier run of the same capture; then set the scale.
 
-    ``key`` is that of what the poses depend on. Returns metres per unit of the poses; ``factor`` passes in
+    ``key`` is that of what the poses depend on. Returns the scale that the options give; ``scale`` passes in
     what another process found.
     """
     path, shard = options.out / POSES_FILE, Shard.of(options.shard)
@@ -94,10 +95,13 @@ def solved_poses(
         _save_solved(path, solved, key)
     capture.solved = solved
     capture.scale_measured = (options.known_length or options.distance) is not None
-    factor = _factor(capture, options) if factor is None else factor
-    if factor is not None:
-        capture.rescale(factor)
-    return factor
+    scale = known_scale(capture, options, partial(_maps, capture, options)) if scale is None else scale
+    if scale is not None:
+        capture.rescale(scale.factor)
+        if scale.doubt is not None:
+            capture.scale_measured = False
+            capture.notes.append(scale.doubt)
+    return scale
 
 
 def _save_solved(path: Path, solved: SolvedCapture, key: str) -> None:
@@ -128,49 +132,6 @@ def load_solved(path: Path, key: str) -> SolvedCapture | None:
         return None
 
 
-def _length(capture: Capture, options: CaptureOptions) -> tuple[list[str], np.ndarray, float] | None:
-    """Frames of ``--distance``, or frame and two pixels of ``--known-length``, and the metres between."""
-    if options.distance is not None:
-        option, typed, form = "--distance", options.distance, "NAME,NAME,METRES"
-        *names, metres = (word.strip() for word in typed.split(","))
-        words = [metres]
-    elif options.known_length is not None:
-        option, typed, form = "--known-length", options.known_length, "NAME:X1,Y1,X2,Y2,METRES"
-        name, _, rest = typed.rpartition(":")
-        names, words = [name], rest.split(",")
-    else:
-        return None
-    try:
-        *numbers, length = map(float, words)
-    except ValueError:
-        numbers, length = [math.nan], math.nan
-    if (len(names), len(numbers)) not in ((2, 0), (1, 4)):
-        bad_value(option, form, repr(typed))
-    check_positive(length, option, "metres")
-    ends, (width, height) = np.array(numbers).reshape(-1, 2), capture.frame(names[0]).size
-    if not ((ends >= 0) & (ends <= (width - 1, height - 1))).all():
-        bad_value(option, f"pixels of {width}x{height}", repr(typed))
-    return [capture.frame(name).name for name in names], ends, length
-
-
-def _factor(capture: Capture, options: CaptureOptions) -> float | None:
-    """Metres per unit of the poses; that of ``--known-length`` by the depth of its frame."""
-    given = _length(capture, options)
-    if given is None:
-        return options.metres_per_unit
-    names, ends, metres = given
-    solved, numbers = capture.solve(), [capture.names.index(name) for name in names]
-    if options.distance is not None:
-        apart = float(np.linalg.norm(np.diff(solved.E[numbers, :3, 3], axis=0)))
-        if not apart > 0:
-            bad_value("--distance", "of two frames with different positions", repr(options.distance))
-        return metres / apart
-    depth = single_map(_depth(capture, _pipe(options), names[0], options).prediction)
-    rays = np.linalg.solve(solved.K[numbers[0]], np.c_[ends, np.ones(2)].T).T
-    points = rays * depth[tuple(np.rint(ends).astype(int).T[::-1])][:, None]
-    return metres / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
-
-
 def _pipe(options: CaptureOptions) -> Any:
     prior = "map" if options.prior_map is not None else options.prior
     device = pick_device(options.device)
@@ -189,6 +150,12 @@ def _depth(
         call["depth_map"] = read_map(path, f"--prior-map of {name}")
     with torch.no_grad():
         return capture.depth(pipe, name, options.neighbours, seed=options.seed, points=points, **call)
+
+
+def _maps(capture: Capture, options: CaptureOptions, name: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """Depth and confidence of one frame by a run of its own."""
+    output = _depth(capture, _pipe(options), name, options)
+    return single_map(output.prediction), None if output.confidence is None else single_map(output.confidence)
 
 
 def _make_frame(capture: Capture, options: CaptureOptions, loaded: Callable[[], Any], item: Item) -> Record:
@@ -271,7 +238,7 @@ def _frame_by_name(options: CaptureOptions, keys: RunKeys) -> Callable[[str], Re
     """What an actor does with the name of a frame."""
     with collected_warnings(silent):  # the driver has told them
         capture = open_capture(options)
-        solved_poses(capture, options, keys.poses_key, keys.factor)
+        solved_poses(capture, options, keys.poses_key, keys.scale)
     loaded = cache(partial(_pipe, options))
     return lambda name: _make_frame(capture, options, loaded, Item(name, inputs=keys.frames_key))
 
@@ -339,7 +306,7 @@ def _help(options: CaptureOptions, items: list[Item], keys: RunKeys, shard: Shar
         with ending_with_parent():
             with collected_warnings(silent):  # the first process has told them
                 capture = open_capture(options)
-                solved_poses(capture, options, keys.poses_key, keys.factor)
+                solved_poses(capture, options, keys.poses_key, keys.scale)
             with collected_warnings(say):
                 _work(capture, options, items, shard)
     except KeyboardInterrupt:  # said by the first process
@@ -398,15 +365,15 @@ def _depth_of_frames(
     check_poses(made_from, options.out, options.overwrite)
     if not options.poses_only:
         begin_frames(made_from, options.out, names, options.overwrite)
-    factor = solved_poses(capture, options, poses_key)
+    scale = solved_poses(capture, options, poses_key)
     seconds = {"poses": progress.seconds()}
     solved = capture.solve()
     progress.tell(f"poses {solved.status}: matches lie {solved.residual_px:.2f} px off their epipolar lines")
-    for note in solved.notes:
+    for note in (*solved.notes, *([scale.doubt] if scale and scale.doubt else ())):
         warn(note)
     if options.poses_only:
         return {"unit": capture.unit, "poses": _pose_report(capture)} | _outcome([])
-    frames = _run_frames(capture, options, names, RunKeys(poses_key, key, factor), progress.bar)
+    frames = _run_frames(capture, options, names, RunKeys(poses_key, key, scale), progress.bar)
     outcome = _outcome(frames)
     if not Shard.of(options.shard).whole:
         return {"unit": capture.unit} | outcome
@@ -428,12 +395,22 @@ def _depth_of_frames(
         "seconds": seconds,
         "files": files,
         "agreement": agreement,
+        "measured": _measured(capture, options, outcome, scale),
         "notes": capture.notes,
         "messages": as_records(capture.notes, solved.notes),
         **outcome,
     }
     write_text(options.out / SUMMARY, json.dumps(report, indent=2) + "\n")
     return report
+
+
+def _measured(
+    capture: Capture, options: CaptureOptions, outcome: Record, scale: KnownScale | None
+) -> list[Record]:
+    """What ``--measure`` asks for of the frames that got depth."""
+    spans = [span for span in spans_to_measure(capture, options) if span.frame not in outcome["failed"]]
+    spread = capture.solve().scale_spread if scale is None else scale.spread
+    return measure(capture, spans, options.out, outcome["not_trusted"], spread if spread > 0 else 0.0)
 
 
 def _outcome(frames: list[Record]) -> Record:

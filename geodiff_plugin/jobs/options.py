@@ -439,6 +439,10 @@ class CaptureOptions(SpeedOptions, PriorOptions):
     distance: str | None = _camera(
         None, "Two frames and the distance between their cameras, as NAME,NAME,METRES."
     )
+    measure: tuple[str, ...] = _output(
+        (),
+        "Measure the distance between two pixels of a frame, as NAME:X1,Y1,X2,Y2; repeatable.",
+    )
     k: Path | None = _camera(None, "Intrinsics of all frames: a 3x3 matrix as text or .npy.", "--K")
     fov: float | None = _camera(None, "Horizontal field of view in degrees.")
     trajectory: Path | None = _camera(

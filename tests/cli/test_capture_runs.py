@@ -224,3 +224,29 @@ def test_a_finished_capture_is_exported_for_splats_and_read_back(scan, geodiff):
     assert known.mean() > 0.5
     np.testing.assert_allclose(units[known] * 1e-3, depth[known], atol=6e-4)
     np.testing.assert_array_equal(np.asarray(Image.open(exported / frame["depth_mask_path"])) > 0, known)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
+def test_a_killed_capture_resumes_to_the_same_bytes(tmp_path):
+    write_transforms(tmp_path / "scan", TRUE, TRUE)
+
+    def command_into(out):
+        words = ["capture", tmp_path / "scan", "--out", out, *QUICK]
+        return [sys.executable, "-m", "geodiff_plugin", *map(str, words)]
+
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert subprocess.run(command_into(whole)).returncode in (0, 4)
+    with subprocess.Popen(command_into(killed)) as process:
+        deadline = time.monotonic() + 300
+        while not list(killed.glob("f*/report.json")):
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.002)
+        process.kill()
+    made = (killed / "f00/depth_alone.npy").stat().st_mtime_ns
+    assert subprocess.run(command_into(killed)).returncode in (0, 4)
+    assert (killed / "f00/depth_alone.npy").stat().st_mtime_ns == made
+    files = [f"f{i:02d}/{name}.npy" for i in range(4) for name in ("depth", "depth_alone", "confirmed")]
+    for file in [*files, "cloud.ply"]:
+        assert (whole / file).read_bytes() == (killed / file).read_bytes()
+    assert not list(killed.rglob(f"*{PARTIAL}"))

@@ -23,6 +23,7 @@ from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.captures import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
 from geodiff_plugin.jobs import capture as run
+from geodiff_plugin.jobs.lengths import spans_to_measure
 from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.plotting import grid
@@ -205,12 +206,13 @@ def test_f_score_of_clouds():
     assert f_score(grid[:32], grid) == pytest.approx(2 / 3)  # all right, half of it there
 
 
-def depth_by(factor: Callable[[Capture], float], **more):
+def depth_by(factor: Callable[[Capture], float], confidence: float = 0.95, **more):
     """A stand-in for ``Capture.depth``: the true depth times a factor of the capture."""
 
     def depth(capture, pipe, name, *_, **__):
-        values = factor(capture) * render(TRUE[int(name[1:])])[1]
-        return SimpleNamespace(prediction=values[None, ..., None].astype(np.float32), confidence=None, **more)
+        values = (factor(capture) * render(TRUE[int(name[1:])])[1])[None, ..., None].astype(np.float32)
+        sure = np.full_like(values, confidence)
+        return SimpleNamespace(prediction=values, confidence=sure, **more)
 
     return depth
 
@@ -273,13 +275,19 @@ def model(tmp_path, monkeypatch):
     )
 
 
-def a_length() -> str:
-    depth, ends = render(TRUE[3])[1], np.array([[40, 50], [200, 120]])
-    rays = np.linalg.solve(K, np.c_[ends, np.ones(2)].T).T * depth[ends[:, 1], ends[:, 0]][:, None]
-    return f"f03:40,50,200,120,{np.linalg.norm(rays[1] - rays[0])}"
+#: Two pixels of a frame, on two walls of the room.
+ENDS = np.array([[40, 50], [200, 120]])
 
 
-WAYS = [{}, {"metres_per_unit": 2.0}, {"known_length": a_length()}]
+def length_in_the_room(number: int, ends: np.ndarray = ENDS) -> float:
+    """Metres between what two pixels of a frame show, by where their rays meet the walls."""
+    directions = np.c_[(ends - K[:2, 2]) / K.diagonal()[:2], np.ones(2)] @ TRUE[number, :3, :3].T
+    centre = TRUE[number, :3, 3]
+    reach = [min((np.sign(d) * HALF - centre) / d) for d in directions]
+    return float(np.linalg.norm(directions[0] * reach[0] - directions[1] * reach[1]))
+
+
+WAYS = [{}, {"metres_per_unit": 2.0}, {"known_length": f"f03:40,50,200,120,{length_in_the_room(3)}"}]
 WAYS.append({"distance": f"f01,f08,{np.linalg.norm(TRUE[8, :3, 3] - TRUE[1, :3, 3])}"})
 
 
@@ -401,10 +409,73 @@ def test_shards_start_from_poses_that_were_solved_once_and_the_whole_joins_them(
     assert report["files"]["cloud_points"] > 0
 
 
+def test_a_tape_measures_between_two_pixels_of_a_frame(model, tmp_path, capsys):
+    spans = ("f04:40,50,200,120", "f02:40,50,200,120")
+    options = replace(model(known_length=f"f03:40,50,200,120,{length_in_the_room(3)}", measure=spans))
+    run_capture(options)
+    measured = json.loads((tmp_path / "out/capture.json").read_text())["measured"]
+    assert [(m["frame"], m["unit"], m["trusted"]) for m in measured] == [
+        ("f04", "m", False),
+        ("f02", "m", False),
+    ]
+    true = [length_in_the_room(number) for number in (4, 2)]
+    assert [m["length"] for m in measured] == pytest.approx(true, rel=0.01)
+    assert all(0.02 < m["spread"] / m["length"] < 0.2 for m in measured)
+    assert f"f04 (40, 50) to (200, 120): {measured[0]['length']:.2f} ± " in capsys.readouterr().out
+    run_capture(replace(options, known_length=None))
+    words = capsys.readouterr().out
+    assert " units of the poses (not trusted)" in words and " m " not in words
+
+
+def test_what_a_tape_says_is_as_uncertain_as_the_scale_of_the_capture(model, tmp_path, monkeypatch):
+    spreads = []
+    for scale_spread in (0.0, 0.3):
+        found = replace(solved(), E=HALVED, E_given=HALVED, scale_spread=scale_spread)
+        monkeypatch.setattr(SOLVE, lambda *_, found=found, **__: found)
+        (measured,) = run.depth_capture(model(measure=("f04:40,50,200,120",)))["measured"]
+        spreads.append(measured["spread"] / measured["length"])
+    assert spreads[1] == pytest.approx(np.hypot(spreads[0], 0.3))
+
+
+def test_ends_of_a_length_are_pixels_of_the_image_as_taken(tmp_path):
+    """Brown's first coefficient by hand: ``x_taken = x (1 + k1 r^2)``."""
+    k1, ends = -0.12, np.array([[30.0, 40.0], [200.0, 150.0]])
+    write_transforms(tmp_path, TRUE, TRUE, k1=k1)
+    rays = (ends - K[:2, 2]) / K.diagonal()[:2]
+    taken = rays * (1 + k1 * (rays**2).sum(1, keepdims=True)) * K.diagonal()[:2] + K[:2, 2]
+    typed = "f04:" + ",".join(map(repr, taken.reshape(-1).tolist()))
+    (span,) = spans_to_measure(Capture.open(tmp_path), CaptureOptions(path=tmp_path, measure=(typed,)))
+    np.testing.assert_allclose(span.ends, ends, atol=1e-3)
+    np.testing.assert_allclose(span.taken, taken)
+    far = CaptureOptions(path=tmp_path, measure=("f04:0,0,100,100",))
+    with pytest.raises(InputError, match="image without lens distortion has"):
+        spans_to_measure(Capture.open(tmp_path), far)
+
+
+@pytest.mark.parametrize("confidence", [0.95, 0.1])
+def test_a_scale_from_depth_that_nobody_is_sure_of_is_not_trusted(confidence, model, monkeypatch):
+    sure = depth_by(lambda capture: 0.5, confidence, unit=None)
+    monkeypatch.setattr(run, "_depth", sure)
+    options = model(known_length=f"f03:40,50,200,120,{length_in_the_room(3)}")
+    capture = run.open_capture(options)
+    scale = run.solved_poses(capture, options, "key")
+    assert scale.factor == pytest.approx(2, rel=0.01)
+    doubted = confidence == 0.1
+    assert [note.code for note in capture.doubts] == ["capture.length"] * doubted
+    assert capture.scale_measured is not doubted
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"known_length": "f01:1,2,3,4,-1"}, "above 0"),
+        ({"known_length": "f01:1,2,1,2,1"}, "two different pixels"),
+        ({"known_length": "f01:1,2,nan,2,1"}, "240x180"),
+        ({"distance": "f01,f02"}, "NAME,NAME,METRES"),
+        ({"distance": "f01,f02,far"}, "NAME,NAME,METRES"),
+        ({"measure": ("f02:1,2,3",)}, "NAME:X1,Y1,X2,Y2"),
+        ({"measure": ("1,2,3,4",)}, "NAME:X1,Y1,X2,Y2"),
+        ({"measure": ("f01:1,2,3,4",)}, "frames that get depth"),
         ({"distance": "f01,f01,1"}, "different positions"),
         ({"known_length": "f01:1,2,3,4"}, "NAME:X1,Y1,X2,Y2,METRES"),
         ({"known_length": "f01:1,2,999,4,1"}, "240x180"),
