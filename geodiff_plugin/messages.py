@@ -194,6 +194,11 @@ MESSAGES: dict[str, MessageKind] = {
         cause="cam1 is missing, or differs from cx0 + doffs, which the ground truth was made with.",
         cure="Nothing if the file is as published; otherwise correct doffs or cam1.",
     ),
+    "calibration.assumed-lens": MessageKind(
+        "The lens of SceneFlow's images is assumed",
+        cause="Its camera_data.txt has no intrinsics, and the folder's name does not say the lens.",
+        cure="Nothing for 35 mm; else keep Driving's folder 15mm_focallength in the path.",
+    ),
     "calibration.kitti-cameras": MessageKind(
         "KITTI's colour cameras are taken",
         cause="The calibration holds a grey and a colour pair, and nothing says which is meant.",

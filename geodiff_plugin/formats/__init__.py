@@ -12,6 +12,7 @@ _NAMES = {
     "depth": ("read_depth_png", "write_depth_mm", "write_depth_npy", "write_pfm"),
     "files": ("check_file", "read_matrix", "read_text"),
     "images": ("as_image_01", "picture_size", "read_image"),
+    "lidar": ("read_lidar",),
     "maps": ("read_pfm",),
     "out": ("atomic_path",),
     "points": ("read_points",),

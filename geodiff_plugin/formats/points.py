@@ -26,7 +26,8 @@ PCD_TYPES = {"F": "f", "U": "u", "I": "i"}
 FOREIGN = {
     ".bin": (
         "points of a lidar in its own frame (KITTI's velodyne)",
-        "Take them to the left camera's frame by calib_velo_to_cam and R_rect, and save them as .npy.",
+        "geodiff depth reads them with KITTI's --calib (calib_velo_to_cam.txt beside it); in Python: "
+        "formats.read_lidar(file, [calibration]).",
     ),
 }
 COLUMNS = (3, 4, 6)  # x y z, with an intensity, or with a colour

@@ -31,6 +31,9 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "spring": CalibrationFormat(
         "Spring's intrinsics.txt (fx fy cx cy a line)",
         rf"\A(?:\s*{_NUMBER}(?:[ \t]+{_NUMBER}){{3}}[ \t]*(?:\n|\Z))+\s*\Z", stereo.read_spring),
+    "sceneflow": CalibrationFormat(
+        "SceneFlow's camera_data.txt (Frame, L, R)", r"\A\s*Frame[ \t]+\d+[ \t]*\r?\n[ \t]*L[ \t]",
+        stereo.read_sceneflow, by_image=True),
     "foundation_stereo": CalibrationFormat(
         "K.txt of FoundationStereo (9 numbers, baseline)", r"\A(?i:[-+.\de\s,]|nan|inf)+\Z",
         stereo.read_foundation_stereo),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection
+from pathlib import PurePath
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from geodiff_plugin.formats.rigs import (
     two_cameras,
 )
 from geodiff_plugin.formats.storage import read_storage
+from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Rig
 
@@ -34,6 +36,14 @@ PAIRS = ((0, 1), (2, 3))
 FOLDER = re.compile(r"(image|colored)_0?([0-3])(?!\d)")
 #: What the baseline is called, in metres.
 BASELINES = ("baseline_meters", "baseline_m", "baseline")
+#: A frame of SceneFlow: its number, and a line for each camera.
+SCENEFLOW_FRAME = re.compile(
+    r"^Frame[ \t]+(\d+)[ \t]*\r?\n[ \t]*L[ \t]+(.*)\n[ \t]*R[ \t]+(.*)$", re.MULTILINE
+)
+#: Its lenses, by the names of Driving's folders.
+SCENEFLOW_FOCAL_PX = {"35mm": 1050.0, "15mm": 450.0}
+SCENEFLOW_CENTRE = (479.5, 269.5)
+SCENEFLOW_SIZE = (960, 540)
 #: Metres between the cameras of Spring, which its files do not say.
 SPRING_BASELINE_M = 0.065
 
@@ -97,6 +107,33 @@ def read_spring(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     return make_rig(camera, camera, SPRING_BASELINE_M, rectified=True)
 
 
+def read_sceneflow(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """SceneFlow's ``camera_data.txt``: poses of both cameras a frame, camera-to-world in Blender's axes.
+
+    K is not in the file: that of the published 960x540 images, by the folder's name for the two lenses of
+    Driving. Lengths are units of Blender's.
+    """
+    frames = SCENEFLOW_FRAME.findall(texts[0])
+    poses = {int(number): (left, right) for number, left, right in frames}
+    left_image = str(choice.image_names[0]) if choice.image_names else ""
+    digits = re.findall(r"\d+", PurePath(left_image.replace("\\", "/")).stem)
+    number = int(digits[-1]) if digits else -1
+    if number not in poses:
+        expected = f"named by its frame, {min(poses)} to {max(poses)}, as 0006.png"
+        bad_value("the left image", expected, left_image or "no name")
+    lens = next((name for name in SCENEFLOW_FOCAL_PX if f"{name}_focallength" in left_image), None)
+    if lens is None:
+        sentence = "Assumed: SceneFlow's 35 mm lens (1050 px); Driving has images of 15 mm (450 px) as well."
+        warn(Message("calibration.assumed-lens", sentence))
+    focal = SCENEFLOW_FOCAL_PX[lens or "35mm"]
+    camera = Camera(intrinsics(focal, focal, *SCENEFLOW_CENTRE), SCENEFLOW_SIZE)
+    of_sides = zip(("L", "R"), poses[number], strict=True)
+    E_left, E_right = (
+        rigid(numbers.split(), f"{side} of frame {number}") @ OPENGL_FROM_OPENCV for side, numbers in of_sides
+    )
+    return make_rig(camera, camera, np.linalg.inv(E_left) @ E_right)
+
+
 def _kitti_cameras(available: Collection[int], choice: CameraChoice) -> tuple[int, int]:
     """The pair that was given, else of the image folder's name, else the colour pair, else the only one."""
     have = sorted(available)
@@ -111,13 +148,25 @@ def _kitti_cameras(available: Collection[int], choice: CameraChoice) -> tuple[in
     return two_cameras(choice, have, pairs[-1])
 
 
+def _kitti_projections(text: str, choice: CameraChoice) -> list[tuple[np.ndarray, list[str] | None]]:
+    """``(3, 4)`` projections of the left and the right camera, and the words of their sizes, if there."""
+    rows = {key: words.split() for key, words in re.findall(r"(?m)^\s*(\w+)\s*:(.*)$", text)}
+    named = {int(match[2]): match for match in map(PROJECTION.fullmatch, rows) if match}
+    pair = (named[camera] for camera in _kitti_cameras(named, choice))
+    return [(array_of(rows[m[0]], (3, 4), m[0]), rows.get(f"S_rect_{m[2]}")) for m in pair]
+
+
 def read_kitti(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """``P_rect_02`` with ``S_rect_02`` of ``calib_cam_to_cam``, or ``P0`` to ``P3``; DrivingStereo's too."""
-    rows = {key: words.split() for key, words in re.findall(r"(?m)^\s*(\w+)\s*:(.*)$", texts[0])}
-    named = {int(match[2]): match for match in map(PROJECTION.fullmatch, rows) if match}
-    left, right = (named[camera] for camera in _kitti_cameras(named, choice))
-    P = (array_of(rows[match[0]], (3, 4), match[0]) for match in (left, right))
-    return projected(*P, *(rows.get(f"S_rect_{match[2]}") for match in (left, right)))
+    (P_left, size_left), (P_right, size_right) = _kitti_projections(texts[0], choice)
+    return projected(P_left, P_right, size_left, size_right)
+
+
+def left_projection_of_kitti(text: str, choice: CameraChoice) -> np.ndarray:
+    """``(3, 4)`` of the left camera that ``read_kitti`` takes; ``InputError`` for another calibration."""
+    if not re.search(r"(?m)^\s*P(?:_rect_|)\d+\s*:", text):
+        bad_value("calibration", "one of KITTI (P_rect_02, or P0 to P3)", "another")
+    return _kitti_projections(text, choice)[0][0]
 
 
 def read_mvsnet(texts: tuple[str, ...], choice: CameraChoice) -> Rig:

@@ -35,6 +35,7 @@ from geodiff_plugin.formats.lenses import (
     undistorted_pixels,
     undistorted_points,
 )
+from geodiff_plugin.formats.lidar import LIDAR_SUFFIX, read_lidar
 from geodiff_plugin.formats.reading import is_as_stored
 from geodiff_plugin.formats.recordings import both_halves
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
@@ -292,7 +293,10 @@ def _read_known(
         return depth_of_disparity(options.disparity, rig, size, "--disparity", per_px=per_px)
     if options.points is None:
         return None
-    known = read_points(options.points, "--points", scale=options.points_scale)
+    if options.points.suffix.lower() == LIDAR_SUFFIX:
+        known = _read_lidar(options, options.points)
+    else:
+        known = read_points(options.points, "--points", scale=options.points_scale)
     if lens is None or known.shape[1] == 3:
         return known
     if known.shape[::-1] != size:
@@ -300,6 +304,13 @@ def _read_known(
         cure = "A map belongs to the image as it was taken, pixel by pixel; else give points (N, 3)."
         bad_value("--points", f"a map of the left image's {expected} pixels", got, cure)
     return undistorted_points(known, K, lens)
+
+
+def _read_lidar(options: DepthOptions, path: Path) -> np.ndarray:
+    """Points of KITTI's lidar in the left camera's frame, by the calibration of both."""
+    if options.points_scale is not None:
+        bad_value("--points-scale", "left out for points of a lidar, in metres", options.points_scale)
+    return read_lidar(path, options.calib, options.camera_pair(), str(options.left), "--points")
 
 
 def pinhole(

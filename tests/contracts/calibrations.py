@@ -202,6 +202,12 @@ def spring(rig: Drawn) -> tuple[str, ...]:
     return (f"{words(rig.numbers(0))}\n{words(rig.numbers(0))}\n",)
 
 
+def sceneflow(rig: Drawn) -> tuple[str, ...]:
+    """camera_data.txt of Driving: camera-to-world poses in Blender's axes, a block a frame."""
+    poses = [np.linalg.inv(T) @ np.diag([1.0, -1, -1, 1]) for T in rig.worlds]
+    return ("".join(f"Frame {n}\nL {words(poses[0])}\nR {words(poses[1])}\n\n" for n in (5, 6)),)
+
+
 def euroc(rig: Drawn) -> tuple[str, ...]:
     texts = []
     for n, T in enumerate(rig.worlds):
@@ -404,7 +410,7 @@ RECTIFIED = (
     *(middlebury, middlebury_blanks, kitti_cam_to_cam, kitti_projections, booster, stereodemo, ros, ros_echo),
     opencv_projections,
 )
-ONE_CAMERA = (foundation_stereo, orb_slam_rectified, cityscapes, spring)
+ONE_CAMERA = (foundation_stereo, orb_slam_rectified, cityscapes, spring, sceneflow)
 
 #: A rig of 0.12 m in every format, by the name of the function.
 K = np.array([[700.0, 0, 300], [0, 700.0, 200], [0, 0, 1]])
@@ -417,7 +423,9 @@ def choice(sample: str, baseline_m: float = 0.12) -> dict[str, Any]:
     """What ``read_calibration`` needs beside the text."""
     by_name = {"image_names": NAMES, "baseline_m": baseline_m}
     needed = {"zed": {"image_size": (1280, 720)}, "colmap": by_name, "nerf": by_name}
-    return (needed | {"spring": {"baseline_m": baseline_m}}).get(sample, {})
+    needed |= {"spring": {"baseline_m": baseline_m}}
+    by_frame = tuple(f"35mm_focallength/fast/{side}/0006.png" for side in ("left", "right"))
+    return (needed | {"sceneflow": by_name | {"image_names": by_frame}}).get(sample, {})
 
 
 def written(folder: Path, texts: tuple[str, ...]) -> Path | tuple[Path, ...]:

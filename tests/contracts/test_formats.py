@@ -231,6 +231,18 @@ def test_spring_chooses_a_line_by_the_number_of_the_image(tmp_path):
         of.read_texts(tmp_path, text, image_names=("frame_left_0003.png", "frame_right_0003.png"))
 
 
+def test_sceneflow_has_the_lens_that_its_folder_names(tmp_path):
+    text = SAMPLES["sceneflow"][0]
+    for folder, focal in (("15mm_focallength/left", 450.0), ("35mm_focallength/left", 1050.0)):
+        rig = of.read_texts(tmp_path, text, image_names=(f"{folder}/0005.png", "0005.png"), baseline_m=1.0)
+        np.testing.assert_array_equal(rig.K_left, [[focal, 0, 479.5], [0, focal, 269.5], [0, 0, 1]])
+        assert rig.size_left == (960, 540)
+    with pytest.warns(UserWarning, match="35 mm lens"):
+        of.read_texts(tmp_path, text, image_names=("left/0005.png", "right/0005.png"), baseline_m=1.0)
+    with pytest.raises(InputError, match="named by its frame, 5 to 6"):
+        of.read_texts(tmp_path, text, image_names=("left/0009.png", "right/0009.png"))
+
+
 def test_sockets_of_an_oak_may_have_names(tmp_path):
     text = SAMPLES["oak"][0]
     data = json.loads(text)
