@@ -1,4 +1,4 @@
-"""Videos, read by OpenCV, and bags of ROS 1, ROS 2 and MCAP, by ``rosbags`` (extra ``ros``)."""
+"""Videos, read by OpenCV, and bags: of ROS by ``rosbags`` (extra ``ros``), of protobuf by ``foxglove``."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from geodiff_plugin._checks import InputError, InputFileError, bad_value, refuse
 from geodiff_plugin.formats.bag_images import CODED, DECODE_CODED, both_as_01, decode_image
 from geodiff_plugin.formats.depth import depth_mm
 from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.foxglove import ROS_PROFILES, FoxgloveReader, profile_of
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 BAG_SUFFIXES = (".mcap", ".bag")
@@ -105,6 +106,12 @@ def is_bag(path: Path) -> bool:
 
 
 def _open_bag(path: Path) -> Any:
+    profile = profile_of(path)
+    if profile == "ros1":
+        cure = "Give the .bag that it was made from, or record it by ROS 2."
+        bad_value("LEFT", "a .bag of ROS 1, or an MCAP file of ROS 2", f"{path}, an MCAP file of ROS 1", cure)
+    if profile is not None and profile not in ROS_PROFILES:
+        return FoxgloveReader(path)
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -125,9 +132,11 @@ def _connections(reader: Any, path: Path, topic: str) -> list[Any]:
     return [connection for connection in images if connection.topic == topic]
 
 
-def _header_ns(raw: bytes | memoryview, is_ros2: bool) -> int:
+def _header_ns(reader: Any, raw: Any) -> int:
     """Nanoseconds in the header, which every message with an image begins with."""
-    layout = "<4xII" if not is_ros2 or raw[1] & 1 else ">4xII"
+    if isinstance(reader, FoxgloveReader):
+        return reader.header_ns(raw)
+    layout = "<4xII" if not reader.is2 or raw[1] & 1 else ">4xII"
     seconds, nanoseconds = struct.unpack_from(layout, raw)
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
@@ -140,16 +149,12 @@ def list_pairs(path: Path, topics: tuple[str, str], tolerance_s: float) -> tuple
         with _open_bag(path) as reader:
             for topic in topics:
                 messages = reader.messages(_connections(reader, path, topic))
-                stamps.append(sorted(Stamp(_header_ns(raw, reader.is2), at) for _, at, raw in messages))
+                stamps.append(sorted(Stamp(_header_ns(reader, raw), at) for _, at, raw in messages))
     except InputError:
         raise
     except Exception as error:  # of any kind that a damaged bag leads to
         said = str(error).partition("\n")[0] or type(error).__name__
-        if "Profile is not ros2" in said:  # rosbags' words for messages of another kind, such as protobuf
-            got = f"{path}, of other ones (protobuf, JSON)"
-            cure = "Write both topics as folders of images, as mcap-protobuf-support can, and give those."
-            bad_value("LEFT", "an MCAP file of ROS 2 messages", got, cure)
-        bad_value("LEFT", "a whole bag that rosbags reads", f"{path} ({said})", "Is it cut off?")
+        bad_value("LEFT", "a whole bag", f"{path} ({said})", "Is it cut off?")
     pairs, free = [], stamps[1]
     for left in stamps[0]:
         at = bisect.bisect(free, left)
@@ -186,7 +191,7 @@ class BagReader(AbstractContextManager["BagReader"]):
     def _image(self, connections: list[Any], stamp: Stamp) -> np.ndarray:
         at = stamp.recorded_ns
         for connection, _, raw in self._reader.messages(connections, at, at + 1):
-            if _header_ns(raw, self._reader.is2) == stamp.header_ns:
+            if _header_ns(self._reader, raw) == stamp.header_ns:
                 return decode_image(self._reader.deserialize(raw, connection.msgtype), self._path)
         raise InputFileError(f"the image of {stamp.header_ns} ns in {self._path} does not read.")
 
@@ -197,7 +202,8 @@ def stereo_calibration(path: Path, topics: tuple[str, str]) -> tuple[list[str], 
     with _open_bag(path) as reader:
         for topic in topics:
             base, _, name = topic.removesuffix("/compressed").rpartition("/")
-            named = [c for c in reader.connections if c.topic == f"{base}/camera_info"]
+            infos = [c for c in reader.connections if c.msgtype.endswith("/CameraInfo")]
+            named = [c for c in infos if c.topic in (f"{base}/camera_info", f"{base}/calibration")]
             first = next(reader.messages(named), None) if named else None
             if first is None:
                 cure = "Give --calib, or the cameras in another way."

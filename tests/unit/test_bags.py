@@ -167,15 +167,6 @@ def test_what_no_reader_decodes_is_named_with_its_cure(tmp_path) -> None:
     path = write_bag(tmp_path / "a.mcap", encoding="jpegxl", images=(GREY, GREY))
     with BagReader(path, TOPICS, 0.005) as reader, pytest.raises(InputError, match="got jpegxl"):
         reader.read(0)
-    mcap = pytest.importorskip("mcap.writer")
-    with open(tmp_path / "foxglove.mcap", "wb") as file:
-        writer = mcap.Writer(file)
-        writer.start()
-        schema = writer.register_schema("foxglove.CompressedImage", "protobuf", b"x")
-        writer.register_channel("/left", "protobuf", schema)
-        writer.finish()
-    with pytest.raises(InputError, match="MCAP file of ROS 2 messages.*protobuf.*mcap-protobuf-support"):
-        list_pairs(tmp_path / "foxglove.mcap", TOPICS, 0.005)
 
 
 def rig_of(path: Path, topics, folder: Path):
@@ -235,5 +226,5 @@ def test_refusals(tmp_path) -> None:
         stereo_calibration(path, ("/image", TOPICS[1]))
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(path.read_bytes()[:3000])
-    with pytest.raises(InputError, match="LEFT must be a whole bag that rosbags reads"):
+    with pytest.raises(InputError, match="LEFT must be a whole bag; got"):
         list_pairs(cut, TOPICS, 0.005)

@@ -453,7 +453,8 @@ def test_ends_of_a_length_are_pixels_of_the_image_as_taken(tmp_path):
 
 
 @pytest.mark.parametrize("confidence", [0.95, 0.1])
-def test_a_scale_from_depth_that_nobody_is_sure_of_is_not_trusted(confidence, model, monkeypatch):
+def test_a_scale_from_depth_that_nobody_is_sure_of_is_not_trusted(confidence, model, tmp_path, monkeypatch):
+    (tmp_path / "out").mkdir()
     sure = depth_by(lambda capture: 0.5, confidence, unit=None)
     monkeypatch.setattr(run, "_depth", sure)
     options = model(known_length=f"f03:40,50,200,120,{length_in_the_room(3)}")
