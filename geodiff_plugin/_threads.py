@@ -61,9 +61,9 @@ class Beside(Generic[T]):
     """The answer of a function that a thread of its own works out while the caller goes on.
 
     A guided call on CUDA makes its evidence like this, beside the network's first steps, which are not
-    guided; and in it the pose check, which keeps the CPU busy while the GPU matches. The thread has the
-    caller's context variables and stream, and takes no gradients. On other devices both would compete for
-    the same cores, so the function is called at once.
+    guided; in it the pose check, which keeps the CPU busy while the GPU matches; and after it the matches of
+    rows, which only the result asks for. The thread has the caller's context variables and stream, and takes
+    no gradients. On other devices both would compete for the same cores, so the function is called at once.
     """
 
     def __init__(self, function: Callable[[], T], device: torch.device) -> None:
@@ -81,6 +81,7 @@ class Beside(Generic[T]):
 
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="geodiff-evidence")
         self.result = self._pool.submit(work).result
+        self._pool.shutdown(wait=False)  # the thread ends with its work, even if nobody asks for the answer
 
     def close(self) -> None:
         """Wait until the thread has ended, whether its answer was asked for or not."""

@@ -10,7 +10,9 @@ from typing import Self
 
 from torch import Tensor
 
+from geodiff_plugin._threads import Beside
 from geodiff_plugin.matching import CostVolume, Matches
+from geodiff_plugin.matching.rows import RowMatches
 from geodiff_plugin.messages import Message
 from geodiff_plugin.scale.points import reliable_matches
 from geodiff_plugin.types import PosedViews, PoseReport
@@ -26,6 +28,7 @@ class Evidence:
     matches: Matches | None  # aggregated, left-right checked, where a term asks
     points: Matches | None = None  # depths that the user knows, in the form of matches
     reliable: Matches | None = None  # ``matches`` as points for the search, where enough are reliable
+    rows: Beside[RowMatches | None] | None = None  # rows matched anew at the image's size, where act 3 asks
     pose: PoseReport | None = None  # how the poses fit
     warnings: tuple[Message, ...] = ()
 

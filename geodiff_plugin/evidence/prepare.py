@@ -8,6 +8,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 import geodiff_plugin.matching as matching
@@ -16,7 +17,8 @@ from geodiff_plugin._threads import Beside, leaves_cpu_free
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.inputs import Inputs
-from geodiff_plugin.matching import clean
+from geodiff_plugin.matching import Matches, clean
+from geodiff_plugin.matching.rows import RowMatches, match_rectified
 from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.pose.refine import refine_views, untouched
@@ -95,11 +97,27 @@ def prepare_evidence(
         matches,
         known_points,
         reliable=None if matches is None else reliable_matches(matches),
+        rows=rows_beside(native, matches, known_points) if config.crisp else None,
         pose=pose,
         warnings=distinct(warnings),  # two checks may find the same mistake
     )
     _read_back(evidence)
     return evidence
+
+
+def rows_beside(
+    native: PosedViews, matches: Matches | None, points: Matches | None
+) -> Beside[RowMatches | None] | None:
+    """The rows of a rectified pair, matched by the CPU while a GPU goes on: act 3 is the first to ask.
+
+    They are sought up to the nearest of the matches and known points.
+    """
+    if matches is None:
+        return None
+    nearest = matches.inverse_depth.amax()
+    if points is not None:
+        nearest = torch.maximum(nearest, points.inverse_depth.amax())
+    return Beside(lambda: match_rectified(native, nearest), native.left_01.device)
 
 
 def _read_back(evidence: Evidence) -> None:

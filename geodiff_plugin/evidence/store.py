@@ -34,7 +34,7 @@ class EvidenceStore:
         """What ``make_evidence`` gives for these arguments; the caller must not change it."""
         views = [value for view in given.views for value in view]
         tensors = [left_01, torch.from_numpy(given.K_left), given.points, *views]
-        knobs = ("pose", "clean_photographs", "depth_range", "planes", "sweep_pixels")
+        knobs = ("pose", "crisp", "clean_photographs", "depth_range", "planes", "sweep_pixels")
         settings = (*(getattr(config, name) for name in knobs), config.search == "volume")
         settings = (*settings, needs_matches, measured, given.unit)
         for held, made_with, evidence, seconds in self._entries:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from geodiff_plugin.geometry import image_size, is_rectified, resize_image
 from geodiff_plugin.matching.census import grey
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PosedViews
 
 #: Parameters of OpenCV's matcher: keep what both views agree on, and drop speckles.
 PARAMETERS = {
@@ -24,6 +26,17 @@ PARAMETERS = {
 MIN_SHIFT_PX = 0.3
 #: No shift exceeds this share of the image's width, which bounds the time of the search.
 MAX_SHIFT = 0.3
+#: Most pixels of the pictures that are matched; larger ones are made smaller.
+MOST_PIXELS = 600_000
+
+
+class RowMatches(NamedTuple):
+    """Matches along the rows of a rectified pair; maps ``(H, W)`` on the grid that they were sought on."""
+
+    shift: Tensor  # pixels from where the point would be at infinity, >= 0
+    matched: Tensor  # 1 where both views agree, else 0
+    filled: Tensor  # 1 in a gap between two matches, where the shift is that of the farther one
+    baseline_m: Tensor  # () distance of the cameras, metres, on the CPU
 
 
 def make_matcher(lowest: int, count: int, channels: int) -> Any:
@@ -65,16 +78,34 @@ def fill_background(shift: np.ndarray) -> np.ndarray:
     return filled[full_rows[np.maximum(above, 0)]].astype(shift.dtype)
 
 
-def match_rows(
-    left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: float
-) -> tuple[Tensor, Tensor, Tensor]:
+def grid_of_rows(size: tuple[int, int]) -> tuple[int, int]:
+    """``(H, W)`` of the grid for a picture or map of a size: the same, within ``MOST_PIXELS``."""
+    share = min(1.0, math.sqrt(MOST_PIXELS / (size[0] * size[1])))
+    return max(1, round(size[0] * share)), max(1, round(size[1] * share))
+
+
+def match_rectified(native: PosedViews, nearest: Tensor) -> RowMatches | None:
+    """Match the left image with the first view that is rectified with it and of its size, if there is one.
+
+    Args:
+        native: the image and its right views, at their own sizes.
+        nearest: ``()`` the largest inverse depth of the search, 1/m.
+    """
+    rectified = [v for v in native.views if is_rectified(native.K_left, v.K, v.T_right_from_left)]
+    view = next((v for v in rectified if image_size(v.image_01) == native.size), None)
+    if view is None:
+        return None
+    size = grid_of_rows(native.size)
+    left, K = resize_image(native.left_01.float(), native.K_left.float(), size)
+    right = CameraView(*resize_image(view.image_01.float(), view.K.float(), size), view.T_right_from_left)
+    baseline_m = view.T_right_from_left[0, 3].abs()
+    return match_rows(left, right, K, float(nearest) * float(K[0, 0] * baseline_m))
+
+
+def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: float) -> RowMatches:
     """Match a rectified pair of one size, ``left_01 (3, H, W)`` in [0, 1] and ``view`` on either side.
 
     ``nearest_px`` is the largest shift of the search.
-
-    Returns:
-        Three ``(H, W)``: the shift in pixels from where the point would be at infinity; 1 where both views
-        agree, else 0; 1 in a gap between two matches, where the shift is that of the farther one.
     """
     images = [(grey(image) * 255.0).round().byte()[0].cpu().numpy() for image in (left_01, view.image_01)]
     infinity = float(K_left[0, 2] - view.K[0, 2])
@@ -95,4 +126,4 @@ def match_rows(
         torch.from_numpy(each[:, ::-1].copy() if mirrored else each).to(left_01.device)
         for each in (shift, known.astype(np.float32), (between & ~known).astype(np.float32))
     ]
-    return maps[0], maps[1], maps[2]
+    return RowMatches(maps[0], maps[1], maps[2], view.T_right_from_left[0, 3].abs())

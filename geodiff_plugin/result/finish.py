@@ -201,7 +201,7 @@ def refine(
         target = correction_target(matches, points, weight, error, fitted_m)
         assert target is not None  # there are matches
         known = known_share(target)
-        fitted_m = vote_depth(fitted_m, evidence.native, target, known, measured, spacing)
+        fitted_m = vote_depth(fitted_m, evidence, target, known, measured, spacing)
         support = support * determined(known, image_size(support))
     return Refined(fitted_m, support)
 

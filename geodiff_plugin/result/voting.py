@@ -20,15 +20,14 @@ from torch import Tensor
 from geodiff_plugin._kernels import launch_bound
 from geodiff_plugin.algorithm.correction import highest, range_around
 from geodiff_plugin.algorithm.edges import HALF, REACH, STRIP
-from geodiff_plugin.geometry import image_size, is_rectified, resize_image, to_device_of
+from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.geometry import image_size, resize_image, to_device_of
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.matching.rows import match_rows
-from geodiff_plugin.types import CameraView, PosedViews
+from geodiff_plugin.matching.rows import RowMatches, grid_of_rows
+from geodiff_plugin.types import PosedViews
 
 #: Difference in brightness at which a neighbour's weight falls to a third.
 BRIGHTNESS = 0.1
-#: Upper bound on the pixels of the voting grid; larger pictures upsample its depth, guided by colour.
-MOST_PIXELS = 600_000
 #: Offsets of the voters in samples: every second one of the window, which is as good as all of them.
 WINDOW = [(v, u) for v in range(-HALF, HALF + 1) for u in range(-HALF, HALF + 1) if (v + u) % 2 == 0]
 #: Pixels between samples of the window: it has to reach beyond the ragged border of a sweep's match.
@@ -82,7 +81,7 @@ class _Votes(NamedTuple):
 @torch.no_grad()
 def vote_depth(
     depth_m: Tensor,
-    native: PosedViews,
+    evidence: Evidence,
     target: Matches,
     known: Tensor,
     error: Tensor,
@@ -99,12 +98,13 @@ def vote_depth(
     deviations ``s``, of match and map together, it differs from the map. Where the matches of a place know
     little, as on a blank wall, all of them count less: ``k`` is their ``known_share``.
 
-    Rows of a rectified view are matched again at this resolution, for edges that the sweep's grid cannot
-    resolve; without such a view of the left image's size the map is returned unchanged.
+    Rows of a rectified view, matched at this resolution, place edges that the sweep's grid cannot resolve.
+    Without them the map is returned unchanged. Pictures of more than ``rows.MOST_PIXELS`` vote on a smaller
+    grid, whose depth is enlarged, guided by colour.
 
     Args:
         depth_m: ``(1, 1, H, W)`` metres, fitted to the matches.
-        native: the image and its right views at their own sizes.
+        evidence: of the image, whose size ``(H, W)`` may differ.
         target: matches and known points, on any grid.
         known: their ``known_share``.
         error: ``(1, 1, 1, 1)`` of the prior in log depth: how much contradicting matches, and the map, count.
@@ -113,27 +113,23 @@ def vote_depth(
     Returns:
         As ``depth_m``, within its range.
     """
-    rectified = [v for v in native.views if is_rectified(native.K_left, v.K, v.T_right_from_left)]
-    view = next((v for v in rectified if image_size(v.image_01) == native.size), None)
-    if view is None:
+    rows = None if evidence.rows is None else evidence.rows.result()
+    if rows is None:
         return depth_m
     full = image_size(depth_m)
-    share = min(1.0, math.sqrt(MOST_PIXELS / (full[0] * full[1])))
-    size = max(1, round(full[0] * share)), max(1, round(full[1] * share))
-    left, K = _resized(native.left_01, native.K_left, size)
-    right = CameraView(*_resized(view.image_01, view.K, size), view.T_right_from_left)
+    size = grid_of_rows(full)
+    rows = _rows_on(size, rows)
+    left, K = _resized(evidence.native, size)
     # Nearest: a mean across an edge is the depth of neither surface.
     small_m, inverse_depth, confidence, known = (
         F.interpolate(each.float(), size, mode="nearest-exact")[0, 0]
         for each in (depth_m, target.inverse_depth, target.confidence, known)
     )
-    px = (K[0, 0] * view.T_right_from_left[0, 3]).abs()  # shift of a depth of 1 m
+    px = K[0, 0] * rows.baseline_m  # shift of a depth of 1 m
     shift, matched_px = px / small_m, px * inverse_depth
-    error = _error_at_edges(error, small_m, share * spacing)
-    nearest = torch.maximum(inverse_depth.amax(), 1.0 / small_m.amin()) * px
-    of_rows, matched, filled = match_rows(left, right, K, float(nearest))
+    error = _error_at_edges(error, small_m, size[1] / full[1] * spacing)
     voters = (
-        _weighed(_Votes(of_rows, known * (ROWS * matched + FILLED * filled)), shift, error),
+        _weighed(_Votes(rows.shift, known * (ROWS * rows.matched + FILLED * rows.filled)), shift, error),
         # The confidence of a known point is a count.
         _weighed(_Votes(matched_px, known * confidence.clamp(0.0, 1.0)), shift, error),
     )
@@ -142,13 +138,22 @@ def vote_depth(
     # The median smooths ragged borders; a map that outvotes its matches has none, and known points stay.
     voted = torch.where((map_vote < 1.0) & (confidence <= 1.0), _median_filtered(voted), voted)
     if size != full:
-        voted = _enlarged(voted, left, _resized(native.left_01, native.K_left, full)[0])
+        voted = _enlarged(voted, left, _resized(evidence.native, full)[0])
     out_m = (px / voted.clamp_min(1e-6))[None, None].clamp(depth_m.amin(), depth_m.amax())
     return out_m.to(depth_m.dtype)
 
 
-def _resized(image_01: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    return resize_image(image_01.float(), K.float(), size)
+def _resized(native: PosedViews, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """The left image ``(3, H, W)`` of a size, and its K."""
+    return resize_image(native.left_01.float(), native.K_left.float(), size)
+
+
+def _rows_on(size: tuple[int, int], rows: RowMatches) -> RowMatches:
+    """Matches of rows on another grid: each pixel takes those of the nearest one."""
+    if image_size(rows.shift) == size:
+        return rows
+    shift, matched, filled = F.interpolate(torch.stack(rows[:3])[None], size, mode="nearest-exact")[0]
+    return RowMatches(shift * (size[1] / rows.shift.shape[1]), matched, filled, rows.baseline_m)
 
 
 def _median_filtered(values: Tensor) -> Tensor:

@@ -59,6 +59,7 @@ STAGES = (
     "    sweep_planes",
     "  match_volume",
     "    aggregate",
+    "  match_rows",
     "Trajectory.settle_scale",
     "  search_scale",
     "  fit_to_points",
@@ -68,7 +69,6 @@ STAGES = (
     "GuidedRun.output",
     "  sharpen_edges",
     "  vote_depth",
-    "    match_rows",
     "  depth_confidence",
 )
 #: One cell of a row of a table.

@@ -13,7 +13,10 @@ from geodiff_plugin.algorithm.gradients import RULES, Adam, FiniteWatch, power_a
 from geodiff_plugin.algorithm.schedule import count_steps, make_schedule
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
 from geodiff_plugin.config import DEFAULT
-from geodiff_plugin.matching import Matches, known_share
+from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.evidence.prepare import rows_beside
+from geodiff_plugin.geometry import image_size
+from geodiff_plugin.matching import Matches, known_share, rows
 from geodiff_plugin.matching.rows import match_rows
 from geodiff_plugin.result import voting
 from geodiff_plugin.result.confidence import MATCH_NOISE_PX, expected_error
@@ -291,17 +294,35 @@ def scene(side: int = 1, doffs: float = 0.0) -> tuple[Tensor, Tensor, CameraView
 def voted(map_m: Tensor, left: Tensor, views, matched_m: Tensor, confidence: float, error=0.4, *spacing):
     target = Matches(1.0 / matched_m, torch.full_like(matched_m, confidence), torch.full((1,), 2e-3))
     native = PosedViews(left[0], tuple(views), CAMERA)
-    return vote_depth(map_m, native, target, known_share(target), torch.full((1, 1, 1, 1), error), *spacing)
+    evidence = Evidence(native, native, None, target, rows=rows_beside(native, target, None))
+    return vote_depth(map_m, evidence, target, known_share(target), torch.full((1, 1, 1, 1), error), *spacing)
 
 
 @pytest.mark.parametrize(("side", "doffs"), [(1, 0.0), (-1, 0.0), (1, 4.0), (-1, 4.0)])
 def test_rows_are_matched_whatever_side_and_principal_point_the_view_has(side, doffs):
     truth, left, view = scene(side, doffs)
-    found, matched, filled = match_rows(left[0], view, CAMERA, 9.0)
-    seen, gaps = matched > 0, filled > 0
-    right = (found - 18.0 / truth[0, 0]).abs()[seen] < 0.5
+    found = match_rows(left[0], view, CAMERA, 9.0)
+    seen, gaps = found.matched > 0, found.filled > 0
+    right = (found.shift - 18.0 / truth[0, 0]).abs()[seen] < 0.5
     assert seen.float().mean() > 0.6 and right.float().mean() > 0.9
     assert gaps.any() and not (gaps & seen).any()
+
+
+def test_a_map_of_another_size_takes_its_edges_from_the_same_rows():
+    truth, left, view = scene()
+    found = match_rows(left[0], view, CAMERA, 9.0)
+    for factor in (0.5, 2.0):
+        small_m = F.interpolate(truth, scale_factor=factor, mode="nearest-exact")
+        resized = voting._rows_on(image_size(small_m), found)
+        assert resized.matched.mean() == pytest.approx(float(found.matched.mean()), abs=0.02)
+        off = (resized.shift - factor * 18.0 / small_m[0, 0]).abs()[resized.matched > 0]
+        assert (off < 0.5 * factor).float().mean() > 0.9
+        moved = torch.roll(small_m, round(-4 * factor), 3)
+        wrong, mended = (
+            float(((depth_m / small_m - 1.0).abs() > 0.1).float().mean())
+            for depth_m in (moved, voted(moved, left, [view], truth, 0.95))
+        )
+        assert mended < 0.6 * wrong
 
 
 def test_a_weak_map_takes_its_edges_from_the_views_and_their_colours(monkeypatch):
@@ -319,7 +340,7 @@ def test_a_weak_map_takes_its_edges_from_the_views_and_their_colours(monkeypatch
     for views in ([], [turned], [view._replace(image_01=view.image_01[..., 1:])]):  # none is rectified
         assert voted(moved, left, views, truth, 0.95) is moved
     monkeypatch.setattr(voting, "STRIP", 700)
-    monkeypatch.setattr(voting, "MOST_PIXELS", 36 * 48)
+    monkeypatch.setattr(rows, "MOST_PIXELS", 36 * 48)
     large = voted(truth, left, [view], truth, 0.95)  # which takes its edges from its colours
     assert ((large < 3.5) != (truth < 3.5))[..., 12:-12].float().mean() < 0.02
 
