@@ -30,6 +30,8 @@ NEAREST_M = 1e-4
 _BEHIND_PX = -1e6
 # Rounding of float32 at image edges: the last pixel centre itself must count as inside.
 EDGE_PX = 1e-2
+#: By how much less, relative to it, another depth hides a pixel: more than a slope rises from cell to cell.
+HIDDEN_MARGIN = 0.05
 
 
 def image_size(image: Tensor) -> tuple[int, int]:
@@ -261,14 +263,13 @@ def hidden_in_right(
     K_right: Tensor,
     T_right_from_left: Tensor,
     size_right: tuple[int, int],
-    *,
-    margin: float = 0.05,
     rays: PlaneRays | None = None,
 ) -> Tensor:
     """Left pixels that another part of the left surface hides from the right camera, ``(B, 1, H, W)`` bool.
 
     The surface is splatted into a depth buffer of the right view, of ``size_right (Hr, Wr)``; a pixel is
-    hidden where the buffer is nearer by more than the relative ``margin``, never outside the right image.
+    hidden where the buffer is nearer by more than ``HIDDEN_MARGIN``, never outside the right image. ``rays``
+    are ``plane_rays`` of these cameras, to be reused.
     """
     batch, _, height, width = depth_m.shape
     if rays is None:
@@ -293,4 +294,4 @@ def hidden_in_right(
         z_splat = torch.where(near, z_seen, torch.full_like(z, far))
         buffer.scatter_reduce_(1, index(target), z_splat.flatten(1), "amin")
     nearest = buffer.gather(1, index(cell.round())).view(batch, height, width)
-    return ((z_seen > nearest * (1.0 + margin)) & seen)[:, None]
+    return ((z_seen > nearest * (1.0 + HIDDEN_MARGIN)) & seen)[:, None]

@@ -64,7 +64,7 @@ MUTANTS = [
         ("v <= size[0] - 1 + EDGE_PX", "v <= size[1] - 1 + EDGE_PX"),
         ("u <= size[1] - 1 + EDGE_PX", "u <= size[1] + EDGE_PX"),
         ("cell = (uv + 0.5) * scale - 0.5", "cell = uv * scale"),
-        ("margin: float = 0.05", "margin: float = 0.1"),
+        ("HIDDEN_MARGIN = 0.05", "HIDDEN_MARGIN = 0.1"),
         tests=(f"{UNIT}geometry.py", f"{UNIT}skew.py"),
     ),
     *of(

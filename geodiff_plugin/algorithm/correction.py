@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._kernels import launch_bound
-from geodiff_plugin.algorithm.solver import solve_robust
+from geodiff_plugin.algorithm.solver import RobustSystem, solve_robust
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import Matches, with_points
@@ -223,10 +223,9 @@ def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: Guid
     def robust(left_over: Tensor) -> Tensor:
         return trusted * _robust(left_over, variance)
 
-    rounds, inertia = REWEIGHTINGS + 1, STIFF_INERTIA * stiff
-    return solve_robust(
-        _scaled(observed.links, stiff), observed.residual, inertia, trusted, robust, rounds, SOLVER_STEPS
-    )[0]
+    links, inertia = _scaled(observed.links, stiff), STIFF_INERTIA * stiff
+    system = RobustSystem(observed.residual, links, inertia, robust)
+    return solve_robust(system, trusted, REWEIGHTINGS + 1, SOLVER_STEPS)[0]
 
 
 def _spread(residual: Tensor, observed: _Observations) -> Tensor:
@@ -304,8 +303,8 @@ def fit_depth(
         data = observed.residual - total
         if k == len(levels) - 1:  # a second right-hand side of ones shows where the correction is decided
             data = torch.cat([data, torch.ones_like(data)], 1)
-        links = _scaled(observed.links, smoothness)
-        part, weights = solve_robust(links, data, inertia, weights, robust, REWEIGHTINGS, SOLVER_STEPS)
+        system = RobustSystem(data, _scaled(observed.links, smoothness), inertia, robust)
+        part, weights = solve_robust(system, weights, REWEIGHTINGS, SOLVER_STEPS)
         total, decided = total + part[:, :1], part[:, 1:]
     size = image_size(depth_m)
     change, support = (

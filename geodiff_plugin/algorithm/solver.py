@@ -107,24 +107,31 @@ def _conjugate_gradients(system: FieldSystem, x: Tensor, steps: int) -> Tensor:
     return x.view(system.pull.shape) * root
 
 
-def solve_robust(
-    links: tuple[Tensor, Tensor],
-    data: Tensor,
-    inertia: Tensor,
-    weights: Tensor,
-    robust: Callable[[Tensor], Tensor],
-    rounds: int,
-    steps: int,
-) -> tuple[Tensor, Tensor]:
+@dataclass(frozen=True)
+class RobustSystem:
+    """The minimiser of ``sum rho(u - data) + sum link |grad u|^2 + inertia sum u^2``.
+
+    ``rho`` grows more slowly than a square, so that what contradicts the rest counts for less. ``data (B, C,
+    H, W)`` are the observations, ``links`` go across and down as in ``FieldSystem``, ``inertia (B, 1, 1, 1)``
+    pulls towards 0. ``robust`` takes the residuals ``(B, 1, H, W)`` of the first channel to the weights
+    ``rho'(r) / 2 r`` of the next round of least squares, which further channels share.
+    """
+
+    data: Tensor
+    links: tuple[Tensor, Tensor]
+    inertia: Tensor
+    robust: Callable[[Tensor], Tensor]
+
+
+def solve_robust(system: RobustSystem, weights: Tensor, rounds: int, steps: int) -> tuple[Tensor, Tensor]:
     """The field of iteratively reweighted least squares, and the weights for one more round.
 
-    ``data (B, C, H, W)`` are the observations, ``inertia (B, 1, 1, 1)`` pulls towards 0, ``weights (B, 1, H,
-    W)`` are those of the first round; ``robust`` makes the next ones from the residuals of the first channel.
-    ``links`` as in ``FieldSystem``, ``steps`` as for ``solve_field``.
+    ``weights (B, 1, H, W)`` are those of the first of ``rounds >= 1``; ``steps`` as for ``solve_field``.
     """
     field: Tensor | None = None
     for _ in range(rounds):
-        field = solve_field(FieldSystem(weights + inertia, weights * data, *links), steps, field)
-        weights = robust(field[:, :1] - data[:, :1])
-    assert field is not None  # rounds >= 1
+        least_squares = FieldSystem(weights + system.inertia, weights * system.data, *system.links)
+        field = solve_field(least_squares, steps, field)
+        weights = system.robust(field[:, :1] - system.data[:, :1])
+    assert field is not None
     return field, weights

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 import gradio as gr
 
 from geodiff_plugin._checks import InputError, bad_value
-from geodiff_plugin.app.job import CAMERA_WAYS, LIMITS, Priors, options_of, photograph_size
+from geodiff_plugin.app.job import CAMERA_WAYS, LIMITS, CameraFields, Priors, options_of, photograph_size
 from geodiff_plugin.app.look import for_visitors
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, REAL_PAIRS_FOLDER
 from geodiff_plugin.jobs.options import DepthOptions
@@ -76,11 +76,12 @@ class Form:
         named = dict(zip(self.fields, values, strict=True))
         for name, label in NUMBERS.items():
             named[name] = _number(named[name], label)
-        lens = {name: named.pop(name) for name in ("fx", "fy", "cx", "cy")}
+        named["lens"] = {name: named.pop(name) for name in ("fx", "fy", "cx", "cy")}
         named |= {name: int(named[name] or 0) for name in ("steps", "ensemble", "resolution", "seed")}
         named |= {name: named[name] or None for name in ("steps", "resolution")}  # 0: the prior's own
         named["calib"] = tuple(named["calib"] or ())
-        return options_of(**named, lens=lens)
+        cameras = CameraFields(**{field.name: named.pop(field.name) for field in fields(CameraFields)})
+        return options_of(cameras=cameras, **named)
 
     def example(self, number: int) -> list[Any]:
         """A value for every field: the files of an example, and all others as they began."""
@@ -159,25 +160,32 @@ def _views() -> dict[str, Any]:
     drawn["baseline"] = _optional("baseline", "as the calibration file says")
 
     with gr.Row(visible=False) as length:
-        drawn["known_length"] = _optional("known_length", "such as a door's height")
-        drawn["ends"] = ends = gr.Textbox(
-            label="Its two ends, px", placeholder="tap them, best in full screen", max_lines=1, elem_id="ends"
-        )
+        drawn |= _length_fields(drawn["left"])
 
     def show(chosen: str) -> list[Any]:
         shown = chosen == "file", chosen != "file", chosen == "numbers", chosen == "photographs"
         return [gr.update(visible=seen) for seen in shown]
+
+    way.change(show, way, [calibration, lens, cx_right, length], **QUICK)
+    return drawn
+
+
+def _length_fields(left: gr.Image) -> dict[str, Any]:
+    """A known length, and its ends, which are typed or tapped on the left photograph."""
+    known_length = _optional("known_length", "such as a door's height")
+    ends = gr.Textbox(
+        label="Its two ends, px", placeholder="tap them, best in full screen", max_lines=1, elem_id="ends"
+    )
 
     def tap(before: list[int], event: gr.SelectData) -> tuple[list[int], str]:
         """The pixels of both ends; a third tap begins anew."""
         pixels = [*before, *event.index] if len(before) == 2 else list(event.index)
         return pixels, ", ".join(map(str, pixels))
 
-    way.change(show, way, [calibration, lens, cx_right, length], **QUICK)
     tapped = gr.State([])  # at the server, where a second tap knows of the first
-    drawn["left"].select(tap, tapped, [tapped, ends], **TAPS)
-    drawn["left"].change(lambda: ([], ""), outputs=[tapped, ends], **QUICK)
-    return drawn
+    left.select(tap, tapped, [tapped, ends], **TAPS)
+    left.change(lambda: ([], ""), outputs=[tapped, ends], **QUICK)
+    return {"known_length": known_length, "ends": ends}
 
 
 def _settings(priors: Priors) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import secrets
 import tempfile
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -76,68 +77,63 @@ def photograph_size(path: str, name: str) -> tuple[int, int]:
     return width, height
 
 
-def options_of(
-    left: str | None,
-    right: str | None,
-    way: str,
-    calib: tuple[str, ...] = (),
-    baseline: float | None = None,
-    cx_right: float | None = None,
-    lens: dict[str, float | None] | None = None,
-    known_length: float | None = None,
-    ends: str | None = None,
-    **run: Any,
-) -> DepthOptions:
-    """The fields of a visitor as options of ``geodiff depth``; ``None`` is an empty field.
+@dataclass(frozen=True)
+class CameraFields:
+    """What a visitor says of the cameras; ``None`` is an empty field."""
 
-    ``way`` is a key of ``CAMERA_WAYS``; fields of another are left out. ``known_length`` is in metres,
-    between the pixels ``ends``.
-    """
+    way: str  # a key of ``CAMERA_WAYS``
+    calib: tuple[str, ...] = ()
+    lens: dict[str, float | None] = field(default_factory=dict)  # fx, fy, cx, cy in pixels
+    cx_right: float | None = None
+    baseline: float | None = None  # metres
+    known_length: float | None = None  # metres, between the pixels ``ends``
+    ends: str | None = None
+
+
+def options_of(left: str | None, right: str | None, cameras: CameraFields, **run: Any) -> DepthOptions:
+    """The fields of a visitor as options of ``geodiff depth``; ``None`` is an empty field."""
     paths = []
     for name, path in (("the left photograph", left), ("the right photograph", right)):
         if path is None:
             refuse(f"{name} is missing: drop a picture into its field.")
         photograph_size(path, name)
         paths.append(Path(path))
-    given = {name: value for name, value in (lens or {}).items() if value is not None}
-    if way == "file" and not calib:
-        refuse("The calibration file is missing: choose one, or give focal length and baseline.")
-    missing = [name for name, value in (("fx", given.get("fx")), ("baseline", baseline)) if value is None]
-    if way == "numbers" and missing:
-        names = " and ".join(missing)
-        refuse(f"Give {names} as well: fx is in pixels, the baseline in metres.")
-    if way == "photographs":
-        run["known_length"] = _length_of_photographs(baseline, known_length, ends)
-    if way != "file" and "fx" in given:
-        run |= given
     return DepthOptions(
-        left=paths[0],
-        right=paths[1],
-        calib=tuple(map(Path, calib)) if way == "file" else (),
-        baseline=baseline,
-        cx_right=cx_right if way == "numbers" else None,
-        estimate_pose=way == "photographs",
-        export=("glb", "mesh"),
-        **run,
+        left=paths[0], right=paths[1], export=("glb", "mesh"), **_options_of_cameras(cameras), **run
     )
 
 
-def _length_of_photographs(
-    baseline: float | None, known_length: float | None, ends: str | None
-) -> str | None:
+def _options_of_cameras(given: CameraFields) -> dict[str, Any]:
+    """The fields of the cameras as options; those that another way needs are left out."""
+    lens = {name: value for name, value in given.lens.items() if value is not None}
+    if given.way == "file":
+        if not given.calib:
+            refuse("The calibration file is missing: choose one, or give focal length and baseline.")
+        return {"baseline": given.baseline, "calib": tuple(map(Path, given.calib))}
+    lens = lens if "fx" in lens else {}
+    if given.way == "numbers":
+        needed = {"fx": lens.get("fx"), "baseline": given.baseline}
+        if missing := [name for name, value in needed.items() if value is None]:
+            refuse(f"Give {' and '.join(missing)} as well: fx is in pixels, the baseline in metres.")
+        return {"baseline": given.baseline, "cx_right": given.cx_right} | lens
+    known_length = _length_of_photographs(given)
+    return {"baseline": given.baseline, "estimate_pose": True, "known_length": known_length} | lens
+
+
+def _length_of_photographs(given: CameraFields) -> str | None:
     """The known length as ``--known-length`` takes it, ``None`` where the baseline is given instead."""
     lengths = "the distance between the cameras, or a length in the left photograph"
-    if baseline is None and known_length is None:
+    if given.baseline is None and given.known_length is None:
         refuse(f"Photographs have no unit: measure {lengths}.")
-    if baseline is not None and known_length is not None:
+    if given.baseline is not None and given.known_length is not None:
         refuse(f"Give {lengths}, not both.")
-    if known_length is None:
+    if given.known_length is None:
         return None
-    numbers = ENDS.findall(ends or "")
+    numbers = ENDS.findall(given.ends or "")
     if len(numbers) != 4:
         cure = "tap both on the left photograph, or type x1, y1, x2, y2"
         refuse(f"The ends of the known length are two pixels: {cure}.")
-    return ",".join([*numbers, f"{known_length}"])
+    return ",".join([*numbers, f"{given.known_length}"])
 
 
 def results_folder() -> Path:
@@ -165,7 +161,7 @@ def run_job(
 
     for name, most in LIMITS.items():
         check_number(getattr(options, name) or 0, FIELD_NAMES.get(name, name), 0, most, integer=True)
-    options.check(lambda field: FIELD_NAMES.get(field.name, field.name))
+    options.check(lambda option: FIELD_NAMES.get(option.name, option.name))
     folder, log = OutFolder(_new_folder()), JobLog()
     with collected_warnings(silent), folder:  # the log has them
         stage(0.0, "Reading the photographs and cameras")

@@ -23,7 +23,7 @@ from geodiff_plugin.formats.layouts import CaptureFrame
 from geodiff_plugin.formats.lenses import undistorted
 from geodiff_plugin.formats.recordings import VideoReader
 from geodiff_plugin.messages import Message
-from geodiff_plugin.pose.multiview import SolvedCapture, solve_capture
+from geodiff_plugin.pose.multiview import GivenFrames, SolvedCapture, solve_capture
 from geodiff_plugin.types import MetricDepthOutput
 
 #: What a solve is called that moved the given poses, or estimated them.
@@ -132,15 +132,12 @@ class Capture:
         check_choice(poses or "refined", "poses", ("refined", "given"))
         if self.solved is None or poses not in (None, self._way):
             self._way = poses or "refined"
-            images, frames = map(self.image, self.names), self.frames
+            images, K = map(self.image, self.names), np.stack([frame.K for frame in self.frames])
             self.solved = solve_capture(
                 (np.rint(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) * 255).astype(np.uint8) for x in images),
-                np.stack([frame.K for frame in frames]),
-                self.poses,
-                [frame.size for frame in frames],
-                threads=threads or available_cores(),
-                names=self.names,
+                GivenFrames(self.names, K, self.poses, [frame.size for frame in self.frames]),
                 poses=self._way,
+                threads=threads or available_cores(),
             )
         return self.solved
 

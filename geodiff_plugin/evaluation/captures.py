@@ -15,7 +15,7 @@ from geodiff_plugin import __version__
 from geodiff_plugin.capture.agreement import agreed, seen_in
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.evaluation.baselines import PriorCache
-from geodiff_plugin.evaluation.experiment import Page, run_experiment
+from geodiff_plugin.evaluation.experiment import Experiment, Page, run_experiment
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.options import CAPTURE_ROWS, CaptureEvalOptions, CaptureRow
 from geodiff_plugin.evaluation.tables import CellOf, Table, grouped, mean_of, table_of_groups
@@ -101,7 +101,8 @@ def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:
         captures = grouped(records, "data").items()
         return [table_of_groups(titles[data], group, ("key",), _CAPTURE_COLUMNS) for data, group in captures]
 
-    return run_experiment(name, options, "Captures", cells, tables, lambda _: (CAPTURE_NOTE,))
+    of_captures = Experiment("Captures", cells, tables, lambda _: (CAPTURE_NOTE,))
+    return run_experiment(name, options, of_captures)
 
 
 def _measure_frames(

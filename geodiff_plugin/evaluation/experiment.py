@@ -106,20 +106,24 @@ def write_page(
     return page
 
 
-def run_experiment(
-    command: str,
-    options: Any,
-    title: str,
-    cells: Sequence[Item],
-    tables: Tables,
-    remarks: Callable[[list[Record]], Sequence[str]] = lambda records: (),
-    journal: str = "",
-) -> Page | None:
+@dataclass(frozen=True)
+class Experiment:
+    """What a command measures, and how its page shows the records of that."""
+
+    title: str
+    cells: Sequence[Item]
+    tables: Tables
+    remarks: Callable[[list[Record]], Sequence[str]] = lambda records: ()  # sentences above the tables
+    journal: str = ""  # file of the records in ``--out``, by default of the command's name
+
+
+def run_experiment(command: str, options: Any, experiment: Experiment) -> Page | None:
     """Measure the cells without a record, and write the page; ``None`` while other shards have cells left."""
-    records = measure_cells(cells, options, journal or f"{command}.jsonl")
+    records = measure_cells(experiment.cells, options, experiment.journal or f"{command}.jsonl")
     if records is None:
         return None
-    page = write_page(command, options, title, tables(records), remarks(records))
+    tables, remarks = experiment.tables(records), experiment.remarks(records)
+    page = write_page(command, options, experiment.title, tables, remarks)
     broken = dict.fromkeys(label_of(record) for record in records if record.get("status") == BROKEN)
     return replace(page, broken=tuple(broken))
 

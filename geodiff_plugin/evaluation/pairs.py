@@ -6,7 +6,7 @@ import importlib
 import statistics
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from operator import itemgetter
@@ -34,23 +34,27 @@ def pair_cells(refs: Sequence[SampleRef], methods: Sequence[str], options: Pairs
     return experiment.method_cells(refs, names, options.settings, options.out, options.save_depth)
 
 
-def compare(
-    name: str,
-    options: PairsOptions,
-    title: str,
-    refs: Sequence[SampleRef],
-    methods: Sequence[str],
-    page_tables: experiment.Tables,
-    more: Sequence[str] = (),
-) -> Page | None:
-    """``run_experiment`` of methods on pairs, with remarks on what was run and ``more``."""
-    cells = pair_cells(refs, methods, options)
+@dataclass(frozen=True)
+class Comparison:
+    """Methods on pairs, and how the page shows their records."""
+
+    title: str
+    refs: Sequence[SampleRef]
+    methods: Sequence[str]
+    tables: experiment.Tables
+    remarks: Sequence[str] = ()  # after those on what was run
+
+
+def compare(name: str, options: PairsOptions, comparison: Comparison) -> Page | None:
+    """``run_experiment`` of methods on pairs, with remarks on what was run."""
+    cells = pair_cells(comparison.refs, comparison.methods, options)
 
     def remarks(records: list[Record]) -> list[str]:
-        return [*remarks_on(records, options), *more]
+        return [*remarks_on(records, options), *comparison.remarks]
 
     journal = experiment.RECORDS_NAME  # all such commands share their records
-    return experiment.run_experiment(name, options, title, cells, page_tables, remarks, journal)
+    of_pairs = experiment.Experiment(comparison.title, cells, comparison.tables, remarks, journal)
+    return experiment.run_experiment(name, options, of_pairs)
 
 
 def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
@@ -94,7 +98,8 @@ def run_pairs(name: str, options: DirOptions) -> Page | None:
         _measure_on_ray(refs, options)
     if options.sample is not None:
         more.append(f"Drawn with seed {options.seed}: {', '.join(ref.label for ref in refs)}.")
-    return compare(name, options, "Results pair by pair", refs, options.methods, tables.pairs_tables, more)
+    title = "Results pair by pair"
+    return compare(name, options, Comparison(title, refs, options.methods, tables.pairs_tables, more))
 
 
 #: What is changed, by table: ``(row, method)``, the unchanged preset first. ``guided`` and ``paper`` stand
@@ -204,7 +209,7 @@ def run_changes(name: str, options: PairsOptions) -> Page | None:
         return [changes_table(records, name), further, tables.details_table(records, tables.REGIONS)]
 
     title = "Flatness" if flat else "Parts of the default"
-    return compare(name, options, title, refs, (*methods, *options.methods), page_tables)
+    return compare(name, options, Comparison(title, refs, (*methods, *options.methods), page_tables))
 
 
 #: The stock pipeline, which everything is compared with; its alignment costs nothing beside it.

@@ -12,7 +12,7 @@ from geodiff_plugin.evaluation.baselines import find_method
 from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, all_refs, select
 from geodiff_plugin.evaluation.experiment import Page
 from geodiff_plugin.evaluation.options import PairsOptions
-from geodiff_plugin.evaluation.pairs import CHANGES, changes_table, compare
+from geodiff_plugin.evaluation.pairs import CHANGES, Comparison, changes_table, compare
 from geodiff_plugin.evaluation.tables import Table, count_of_pairs
 from geodiff_plugin.jobs.journal import Record
 
@@ -241,4 +241,4 @@ def run_paper_table(name: str, options: PairsOptions) -> Page | None:
             shown.append(tables.summary_table(records, column.labels, title))
         return [*shown, tables.details_table(records, tables.REGIONS)]
 
-    return compare(name, options, layout.title, refs, names, page_tables, more)
+    return compare(name, options, Comparison(layout.title, refs, names, page_tables, more))

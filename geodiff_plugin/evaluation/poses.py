@@ -12,7 +12,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.evaluation import experiment, tables
 from geodiff_plugin.evaluation.datasets import SampleRef, find_pairs, load, some_pairs
 from geodiff_plugin.evaluation.datasets.sample import Numbers, changed_ref, two_numbers
-from geodiff_plugin.evaluation.experiment import Page, run_experiment
+from geodiff_plugin.evaluation.experiment import Experiment, Page, run_experiment
 from geodiff_plugin.evaluation.options import PosesOptions
 from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs, headline, label_of
 from geodiff_plugin.jobs.journal import Item, Record
@@ -141,5 +141,5 @@ def run_poses(name: str, options: PosesOptions) -> Page | None:
 
     cells = [cell for comparison in comparisons for cell in _cells(comparison, options)]
     said = f"Prior {options.prior}, seed {options.seed}. All pixels with truth, metres as they come out."
-    journal, title = experiment.RECORDS_NAME, "Results by pose"
-    return run_experiment(name, options, title, cells, page_tables, lambda _: [said], journal)
+    by_pose = Experiment("Results by pose", cells, page_tables, lambda _: [said], experiment.RECORDS_NAME)
+    return run_experiment(name, options, by_pose)

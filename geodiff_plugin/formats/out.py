@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import IO, NoReturn, Self, TypeVar
 
 from geodiff_plugin._checks import InputFileError, MissingFileError, bad_value
+from geodiff_plugin._signals import undisturbed
 
 try:
     import fcntl
@@ -146,21 +147,24 @@ def working_in(folder: Path, *, shared: bool = False) -> Iterator[None]:
     """Have a folder alone, or with others that share it, until the block ends; else ``InputError``."""
     path = folder / FOLDER_LOCK
     with ExitStack() as stack:
-        try:
-            file = stack.enter_context(open(path, "ab"))
-        except OSError as error:
-            unwritable(folder, error)
-        while (taken := lock_file(file, shared)) and os.fstat(file.fileno()).st_nlink == 0:
-            file = stack.enter_context(open(path, "ab"))  # whoever had it has just removed it
-        if not taken:
-            cure = "Wait for it, or name another."
-            bad_value("--out", "a folder that no other run has", f"{folder}, which one is working in", cure)
-        try:
-            yield
-        finally:
-            with suppress(OSError):  # Windows removes no open file
-                if lock_file(file):  # the last of those that shared it
-                    path.unlink()
+        with undisturbed():
+            try:
+                file = stack.enter_context(open(path, "ab"))
+            except OSError as error:
+                unwritable(folder, error)
+            while (taken := lock_file(file, shared)) and os.fstat(file.fileno()).st_nlink == 0:
+                file = stack.enter_context(open(path, "ab"))  # whoever had it has just removed it
+            if not taken:
+                got, cure = f"{folder}, which one is working in", "Wait for it, or name another."
+                bad_value("--out", "a folder that no other run has", got, cure)
+            stack.callback(_remove_lock, path, file)
+        yield
+
+
+def _remove_lock(path: Path, file: IO[bytes]) -> None:
+    with undisturbed(), suppress(OSError):  # Windows removes no open file
+        if lock_file(file):  # the last of those that shared it
+            path.unlink()
 
 
 def _take(hidden: Path, stack: ExitStack) -> bool:
@@ -203,16 +207,20 @@ class OutFolder:
                 got = f"{self.path}, which holds {path}"  # and which the run may replace or delete
                 bad_value("--out", "a folder that holds no input of the run", got, "Name another.")
         self._staging = _hidden(self._target)
-        with ExitStack() as stack:
-            try:
-                self._begin(stack)
-            except OSError as error:
-                unwritable(self.path, error)
-            self._stack = stack.pop_all()
-        return self
+        try:
+            with undisturbed():
+                self._begin(self._stack)
+            return self
+        except OSError as error:
+            self.__exit__()
+            unwritable(self.path, error)
+        except BaseException:
+            self.__exit__()
+            raise
 
     def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        with undisturbed():
+            self._stack.close()
 
     def _begin(self, stack: ExitStack) -> None:
         """Make the hidden folder, take its lock, and clear what a killed run has left in it."""

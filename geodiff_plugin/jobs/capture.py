@@ -31,7 +31,7 @@ from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Record, Shard, sh
 from geodiff_plugin.jobs.lengths import KnownScale, check_lengths, known_scale, measure, spans_to_measure
 from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import OF_SCALE, CaptureOptions
-from geodiff_plugin.jobs.prior import graphs_for_many, load_guided_prior
+from geodiff_plugin.jobs.prior import graphs_for_many, load_quiet_prior
 from geodiff_plugin.jobs.provenance import RECORD, SUMMARY, Provenance, begin_frames, check_poses
 from geodiff_plugin.jobs.report import messages_of, plain, read_report, single_map, verdict_report
 from geodiff_plugin.jobs.runner import Runner
@@ -135,7 +135,7 @@ def load_solved(path: Path, key: str) -> SolvedCapture | None:
 def _pipe(options: CaptureOptions) -> Any:
     prior = "map" if options.prior_map is not None else options.prior
     device = pick_device(options.device)
-    pipe = load_guided_prior(prior, device, options.space)
+    pipe = load_quiet_prior(prior, device, options.space)
     graphs = graphs_for_many(options, device)
     return enable_geometry_guidance(pipe, graphs=graphs, kernels=not options.no_kernels)
 

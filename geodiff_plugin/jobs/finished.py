@@ -8,6 +8,7 @@ from typing import Any
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.files import file_digest
+from geodiff_plugin.jobs.changes import input_change, option_changes
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.report import read_report
 from geodiff_plugin.options import flag_of
@@ -31,10 +32,14 @@ def file_digests(options: DepthOptions) -> dict[str, str]:
 
 
 def changed_options(options: DepthOptions, made: Mapping[str, Any]) -> list[str]:
-    """In words, how the options that a result was made with differ from these, where that changes it."""
+    """In words, how the options that a result was made with differ from these, where that changes it.
+
+    Of an option that ``made`` does not know, as it is a newer one, nothing is said.
+    """
     wanted, of_fields = options.as_json(), DepthOptions.__dataclass_fields__
-    others = [n for n in wanted if n not in NOT_OF_THE_RESULT and wanted[n] != made.get(n, wanted[n])]
-    return [f"made with {flag_of(of_fields[n])} {made[n]} instead of {wanted[n]}" for n in others]
+    names = [name for name in wanted if name in made and name not in NOT_OF_THE_RESULT]
+    before, now = ({flag_of(of_fields[name]): values[name] for name in names} for values in (made, wanted))
+    return option_changes(before, now)
 
 
 def finished_row(options: DepthOptions) -> Row | None:
@@ -54,7 +59,7 @@ def finished_row(options: DepthOptions) -> Row | None:
     changes = changed_options(options, made)
     digests = report.get("pair", {}).get("sha256", {})
     changed = [path for path, digest in file_digests(options).items() if digests.get(path, digest) != digest]
-    changes += [f"made before {path} changed" for path in changed]
+    changes += map(input_change, changed)
     if changes:
         cure = "Name another --out, add --overwrite to repeat all pairs, or remove this folder to repeat one."
         got = f"{options.out}, {', '.join(changes)}"

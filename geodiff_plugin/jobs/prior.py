@@ -29,6 +29,21 @@ def load_guided_prior(
 ) -> Any:
     """A prior with guidance enabled, and with no progress bars but that of a download.
 
+    Arguments and errors as ``load_quiet_prior``.
+    """
+    return enable_geometry_guidance(load_quiet_prior(name, device, space, dtype, options, tell))
+
+
+def load_quiet_prior(
+    name: str,
+    device: torch.device,
+    space: str | None = None,
+    dtype: str = "float32",
+    options: Sequence[str] = (),
+    tell: Tell | None = None,
+) -> Any:
+    """A prior with no progress bars but that of a download, and as yet without guidance.
+
     Args:
         name: as ``--prior`` takes it: ``"bundled"``, a hub id or a folder.
         device: where it runs.
@@ -53,7 +68,7 @@ def load_guided_prior(
             expected = f"one that {prior.key} takes ({', '.join(taken) or 'none'})"
             bad_value("--option", expected, repr(option))
     pipe.set_progress_bar_config(disable=True)
-    return enable_geometry_guidance(pipe)
+    return pipe
 
 
 def graphs_for_many(options: SpeedOptions, device: torch.device) -> bool:
@@ -63,5 +78,5 @@ def graphs_for_many(options: SpeedOptions, device: torch.device) -> bool:
 
 def prior_of_options(options: DepthOptions, device: torch.device, tell: Tell | None = None) -> Any:
     """``load_guided_prior`` as the options say."""
-    pipe = load_guided_prior(options.prior, device, options.space, options.dtype, options.option, tell)
+    pipe = load_quiet_prior(options.prior, device, options.space, options.dtype, options.option, tell)
     return enable_geometry_guidance(pipe, graphs=options.graphs, kernels=not options.no_kernels)

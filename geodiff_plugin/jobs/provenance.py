@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn, Self
@@ -15,6 +15,7 @@ from geodiff_plugin.capture.results import clear_frame
 from geodiff_plugin.formats.files import find_map
 from geodiff_plugin.formats.layouts import CaptureFrame
 from geodiff_plugin.formats.out import REPORT, write_text
+from geodiff_plugin.jobs.changes import input_change, option_changes
 from geodiff_plugin.jobs.journal import Record, fingerprint
 from geodiff_plugin.jobs.options import OF_SCALE, CaptureOptions
 from geodiff_plugin.jobs.report import read_report
@@ -89,10 +90,7 @@ class Provenance:
         said = []
         if made.version != self.version:
             said.append(f"made by version {made.version} instead of {self.version}")
-        for flag, wanted in self.settings.items():
-            if (was := made.settings.get(flag)) != wanted:
-                typed = f"the default of {flag}" if was == UNSET else f"{flag} {was}"
-                said.append(f"made with {typed} instead of {'the default' if wanted == UNSET else wanted}")
+        said += option_changes(_typed(made.settings), _typed(self.settings))
         for kind, wanted_of in self.frames.items():
             was_of = made.frames.get(kind, {})
             if kind == OF_POSES_KINDS[0] and set(was_of) != set(wanted_of):
@@ -100,8 +98,13 @@ class Provenance:
             changed = [name for name in wanted_of if was_of.get(name, wanted_of[name]) != wanted_of[name]]
             if changed:
                 some = ", ".join(changed[:MOST_NAMES]) + ", ..." * (len(changed) > MOST_NAMES)
-                said.append(f"made before the {KINDS[kind]} of {some} changed")
+                said.append(input_change(f"the {KINDS[kind]} of {some}"))
         return said
+
+
+def _typed(settings: Mapping[str, str]) -> dict[str, str | None]:
+    """Settings with ``None`` for an option that was not typed."""
+    return {flag: None if value == UNSET else value for flag, value in settings.items()}
 
 
 def _digests(frame: CaptureFrame, prior_maps: Path | None) -> dict[str, str]:

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from multiprocessing.connection import wait
 from typing import Any
 
+from geodiff_plugin._signals import stop
+
 
 class Terminated(KeyboardInterrupt):
     """The process was asked to end by SIGTERM."""
@@ -18,20 +20,31 @@ class Terminated(KeyboardInterrupt):
 
 def _end(*_: Any) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # asked again it goes on clearing away
-    raise Terminated
+    stop(Terminated)
+
+
+def _interrupt(*_: Any) -> None:
+    stop(KeyboardInterrupt)
 
 
 @contextmanager
 def ending_on_sigterm() -> Iterator[None]:
-    """Raise ``Terminated`` inside the block on SIGTERM; in a thread nothing changes."""
+    """Raise ``Terminated`` inside the block on SIGTERM; that, and Ctrl-C, when no ``undisturbed`` is left.
+
+    In a thread nothing changes, nor where Ctrl-C does something else than Python's own.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, _end)
+    handlers = {signal.SIGTERM: _end}
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        handlers[signal.SIGINT] = _interrupt
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

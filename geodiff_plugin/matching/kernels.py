@@ -37,6 +37,21 @@ _SUMS_AT_ONCE = 1024
 
 
 @triton.jit
+def _line(number, down, across, height, width):
+    """Row and column of the first pixel of a line of an axis, and the steps to its last; -1: no such line."""
+    # Lines begin on the first row, from left to right, and then on the side that the axis comes from.
+    side = tl.where(across < 0, width - 1, 0)
+    on_top = (down > 0) & (number < width)
+    row = tl.where(down > 0, tl.maximum(number - width + 1, 0), number)
+    column = tl.where(on_top, number, side)
+    exists = (row < height) & ((across != 0) | (number < width))
+    to_bottom = tl.where(down > 0, height - row, width)
+    to_side = tl.where(across > 0, width - column, tl.where(across < 0, column + 1, height))
+    last = tl.where(exists, tl.minimum(to_bottom, to_side), 0) - 1
+    return row, column, last
+
+
+@triton.jit
 def paths_kernel(
     levels,
     penalties,
@@ -61,15 +76,7 @@ def paths_kernel(
     for each in tl.static_range(len(DOWN)):
         down = tl.where(axis == each, DOWN[each], down)
         across = tl.where(axis == each, ACROSS[each], across)
-    # Lines begin on the first row, from left to right, and then on the side that the axis comes from.
-    side = tl.where(across < 0, width - 1, 0)
-    on_top = (down > 0) & (line < width)
-    row = tl.where(down > 0, tl.maximum(line - width + 1, 0), line)
-    column = tl.where(on_top, line, side)
-    exists = (row < height) & ((across != 0) | (line < width))
-    to_bottom = tl.where(down > 0, height - row, width)
-    to_side = tl.where(across > 0, width - column, tl.where(across < 0, column + 1, height))
-    last = tl.where(exists, tl.minimum(to_bottom, to_side), 0) - 1
+    row, column, last = _line(line, down, across, height, width)
     row = tl.where(back, row + last * down, row)
     column = tl.where(back, column + last * across, column)
     way = tl.where(back, -1, 1)

@@ -93,46 +93,44 @@ class SolvedCapture:
         return apart, np.degrees((given.inv() * solved).magnitude())
 
 
+@dataclass(frozen=True, eq=False)
+class GivenFrames:
+    """The cameras of all frames as they are given, and what notes call the frames."""
+
+    names: Sequence[str]
+    K: np.ndarray  # (N, 3, 3) pixels
+    E: np.ndarray | None  # (N, 4, 4) camera-to-world; ``None``: poses are estimated from nothing
+    sizes: Sequence[tuple[int, int]]  # (width, height)
+
+
 def solve_capture(
-    images: Iterable[np.ndarray],
-    K: np.ndarray,
-    E: np.ndarray | None,
-    sizes: Sequence[tuple[int, int]],
-    *,
-    names: Sequence[str] | None = None,
-    poses: str = "refined",
-    threads: int = 1,
+    images: Iterable[np.ndarray], given: GivenFrames, *, poses: str = "refined", threads: int = 1
 ) -> SolvedCapture:
     """Solve for the poses of all frames.
 
     Args:
         images: grey ``(H, W)`` uint8, free of distortion; read once, in order.
-        K: ``(N, 3, 3)`` pixels.
-        E: ``(N, 4, 4)`` camera-to-world, or ``None`` to estimate poses from nothing.
-        sizes: ``(width, height)`` of every frame.
-        names: of the frames, for notes; their numbers by default.
+        given: the cameras of the images.
         poses: ``"refined"``, or ``"given"`` to keep the given ones and find points by them.
         threads: of features, matching and adjustment.
     """
     pycolmap()
-    names = [str(number) for number in range(len(sizes))] if names is None else names
     with tempfile.TemporaryDirectory(prefix="geodiff-capture-") as work:
-        base = Reconstruction(Path(work), np.asarray(K, float), sizes, threads)
+        base = Reconstruction(Path(work), np.asarray(given.K, float), given.sizes, threads)
         base.extract(images)
-        base.match(candidate_pairs(E, len(sizes)))
+        base.match(candidate_pairs(given.E, len(given.sizes)))
         blurred = np.flatnonzero(base.features < BLURRED_SHARE * np.median(base.features))
         notes: list[Message] = []
         if len(blurred):
-            these = _some_names([names[int(i)] for i in blurred])
+            these = _some_names([given.names[int(i)] for i in blurred])
             sentence = f"{these}: blurred or without texture; they are no good neighbours of others."
             notes.append(Message("capture.blurred", sentence))
-        if E is None:
+        if given.E is None:
             result = _from_nothing(base, notes)
         else:
-            result = _from_given(
-                base, _in_convention(base, np.asarray(E, float), notes), notes, poses == "refined"
-            )
-        return _noted(result, notes, names)
+            E = _in_convention(base, np.asarray(given.E, float), notes)
+            result = _from_given(base, E, notes, poses == "refined")
+        return _noted(result, notes, given.names)
 
 
 def _some_names(names: Sequence[str]) -> str:

@@ -307,20 +307,14 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         ``None`` for steps and resolution is the prior's default, for ``resample_method_output`` its authors'
         choice (bilinear while guided). ``options`` are further arguments, those of ``prepare_condition``.
         """
-        steps = self.default_denoising_steps if num_inference_steps is None else num_inference_steps
-        resolution = processing_resolution
-        if resolution is None:
-            resolution = self.default_processing_resolution
+        steps, resolution = self._steps_and_resolution(num_inference_steps, processing_resolution)
         resampling = resample_method_output or self.output_resampling
-        check_number(steps, "num_inference_steps", 1, self.max_steps or 1000, integer=True)
-        check_number(resolution, "processing_resolution", 0, 1 << 16, integer=True)
         check_number(ensemble_size, "ensemble_size", 2 if output_uncertainty else 1, 1 << 20, integer=True)
         check_number(batch_size, "batch_size", 1, 1 << 20, integer=True)
         check_choice(output_type, "output_type", ("np", "pt"))
         check_choice(resample_method_input, "resample_method_input", RESAMPLING)
         check_choice(resampling, "resample_method_output", RESAMPLING)
-        unknown = set(options) - set(self.call_options())
-        if unknown:
+        if unknown := set(options) - set(self.call_options()):
             bad_value("arguments of this prior", f"out of {self.call_options()}", sorted(unknown))
         processor, place = self.image_processor, (self._execution_device, self.dtype)
         padded, padding, size = processor.preprocess(image, resolution, resample_method_input, *place)
@@ -355,6 +349,14 @@ class DepthDiffusionPipeline(DepthPrior, DiffusionPipeline):
         common = inspect.signature(DepthDiffusionPipeline.prepare_condition).parameters
         here = inspect.signature(self.prepare_condition).parameters
         return [name for name, p in here.items() if name not in common and p.kind is not p.VAR_KEYWORD]
+
+    def _steps_and_resolution(self, steps: int | None, resolution: int | None) -> tuple[int, int]:
+        """Those of the caller, checked, or the prior's own."""
+        steps = self.default_denoising_steps if steps is None else steps
+        resolution = self.default_processing_resolution if resolution is None else resolution
+        check_number(steps, "num_inference_steps", 1, self.max_steps or 1000, integer=True)
+        check_number(resolution, "processing_resolution", 0, 1 << 16, integer=True)
+        return steps, resolution
 
     def _start(self, condition: Condition, latents: Any, generator: Generators) -> Tensor:
         """Latents of the caller, checked, or those of ``prepare_latents``."""

@@ -80,12 +80,7 @@ class _Votes(NamedTuple):
 
 @torch.no_grad()
 def vote_depth(
-    depth_m: Tensor,
-    evidence: Evidence,
-    target: Matches,
-    known: Tensor,
-    error: Tensor,
-    spacing: float = 1.0,
+    depth_m: Tensor, evidence: Evidence, target: Matches, known: Tensor, error: Tensor, spacing: float = 1.0
 ) -> Tensor:
     """Give every pixel the depth voted by the map and by the matches around it that have its colour.
 

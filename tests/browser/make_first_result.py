@@ -8,7 +8,7 @@ import threading
 import torch
 
 from geodiff_plugin.app.form import EXAMPLES
-from geodiff_plugin.app.job import Priors, options_of, run_job
+from geodiff_plugin.app.job import CameraFields, Priors, options_of, run_job
 from geodiff_plugin.app.page import FIRST_RESULT
 from geodiff_plugin.app.shown import save, shown_of
 
@@ -18,7 +18,7 @@ MEASURED = [(290, 288), (400, 292)]
 if __name__ == "__main__":
     example = EXAMPLES[0]
     right, calibration = example.folder / f"right.{example.ending}", example.folder / "calib.txt"
-    options = options_of(str(example.left), str(right), "file", (str(calibration),))
+    options = options_of(str(example.left), str(right), CameraFields("file", (str(calibration),)))
     with tempfile.TemporaryDirectory() as folder:
         tempfile.tempdir = folder
         priors = Priors(("bundled",), torch.device("cpu"))

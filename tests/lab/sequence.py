@@ -17,7 +17,7 @@ import torch
 from geodiff_plugin import __version__
 from geodiff_plugin.capture.agreement import scene_poses, seen_in, steadied
 from geodiff_plugin.evaluation.baselines import PriorCache
-from geodiff_plugin.evaluation.experiment import Page, run_experiment
+from geodiff_plugin.evaluation.experiment import Experiment, Page, run_experiment
 from geodiff_plugin.evaluation.metrics import evaluate_depth
 from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, most_of, table_of_groups
 from geodiff_plugin.evidence.guidance import GeometryGuidance
@@ -72,7 +72,7 @@ def run(name: str, options: SequenceOptions) -> Page | None:
         cells.append(Item(key, work, name=f"sequence {seed}, {way}", head={"seed": seed, "way": way}))
     of = f"{options.frames} frames, {options.size[1]}x{options.size[0]} pixels, prior {settings.prior}"
     remark = f"{options.scenes} rendered scenes of {of}, {options.steps} steps, seed {options.seed} each."
-    return run_experiment(name, options, "Sequences", cells, page_tables, lambda _: [remark])
+    return run_experiment(name, options, Experiment("Sequences", cells, page_tables, lambda _: [remark]))
 
 
 def _measure(pipe: Any, render: Any, seed: int, way: str, options: SequenceOptions) -> Record:

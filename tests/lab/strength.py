@@ -25,7 +25,7 @@ from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.evaluation import tables
 from geodiff_plugin.evaluation.baselines import NotApplicable, PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, data_of, find_pairs, load
-from geodiff_plugin.evaluation.experiment import DENSE, Page, cell_key, in_metres, run_experiment
+from geodiff_plugin.evaluation.experiment import DENSE, Experiment, Page, cell_key, in_metres, run_experiment
 from geodiff_plugin.evaluation.metrics import evaluate_depth, filled, to_space
 from geodiff_plugin.evaluation.tables import CellOf, Table, mean_of, method_title, most_of
 from geodiff_plugin.jobs.journal import Item, Record
@@ -229,6 +229,5 @@ def run(name: str, options: StrengthOptions) -> Page | None:
 
     said = f"Emulated priors, affine in {options.space}, following their input by {options.follow:g}; "
     said += f"processed at {options.resolution} px, {options.steps} steps, seed {options.seed}."
-    return run_experiment(
-        name, options, "Priors from exact to weak", cells, strength_tables, lambda _: [said]
-    )
+    of_priors = Experiment("Priors from exact to weak", cells, strength_tables, lambda _: [said])
+    return run_experiment(name, options, of_priors)

@@ -21,7 +21,7 @@ from geodiff_plugin.evaluation import experiment, tables
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import call_arguments, guided_configuration
 from geodiff_plugin.evaluation.datasets import SampleRef, StereoSample, find_pairs, load, some_pairs
-from geodiff_plugin.evaluation.experiment import Page, run_experiment
+from geodiff_plugin.evaluation.experiment import Experiment, Page, run_experiment
 from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.jobs.journal import Item, Record
@@ -289,4 +289,4 @@ def run(name: str, options: TrustOptions) -> Page | None:
     def page_tables(records: list[Record]) -> list[Table]:
         return [_table(source, group) for source, group in tables.grouped(records, "group").items()]
 
-    return run_experiment(name, options, "Trust", cells, page_tables)
+    return run_experiment(name, options, Experiment("Trust", cells, page_tables))

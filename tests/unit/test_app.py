@@ -20,7 +20,7 @@ from PIL import Image
 from geodiff_plugin import enable_geometry_guidance
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.app import job, keeping, launch, results
-from geodiff_plugin.app.job import Priors, options_of, run_job
+from geodiff_plugin.app.job import CameraFields, Priors, options_of, run_job
 from geodiff_plugin.app.keeping import Keeper, Session, Sessions, Stopped, Turns
 from geodiff_plugin.app.shown import load, save, shown_of
 from geodiff_plugin.formats import read_calibration, read_image
@@ -76,20 +76,22 @@ def photographs(textured_plane, tmp_path_factory):
 
 def test_fields_become_options_and_those_of_another_way_are_left_out(photographs, tmp_path):
     lens = {"fx": 60.0, "fy": None, "cx": None, "cy": 20.0}
-    numbers = options_of(*photographs, "numbers", ("K.txt",), 0.12, 35.5, lens, seed=3)
+    numbers = options_of(*photographs, CameraFields("numbers", ("K.txt",), lens, 35.5, 0.12), seed=3)
     assert (numbers.fx, numbers.fy, numbers.cx, numbers.cy) == (60.0, None, None, 20.0)
     assert numbers.cx_right == 35.5 and numbers.seed == 3 and numbers.calib == ()
-    file = options_of(*photographs, "file", ("K.txt",), None, 35.5, lens)
+    file = options_of(*photographs, CameraFields("file", ("K.txt",), lens, 35.5))
     assert [path.name for path in file.calib] == ["K.txt"] and file.fx is None and file.cx_right is None
     exif = Image.Exif()
     exif[0x0112] = 6  # lies on its side
     Image.new("L", (64, 48)).save(tmp_path / "turned.jpg", exif=exif)
-    turned = options_of(str(tmp_path / "turned.jpg"), photographs[1], "photographs", (), 0.3, 35.5, lens)
+    turned = options_of(
+        str(tmp_path / "turned.jpg"), photographs[1], CameraFields("photographs", (), lens, 35.5, 0.3)
+    )
     assert turned.estimate_pose and turned.fx == 60.0 and turned.cx_right is None
     known = {"known_length": 0.8, "ends": "12, 40.5, 50, 41"}
-    tapped = options_of(*photographs, "photographs", lens=lens, **known)
+    tapped = options_of(*photographs, CameraFields("photographs", lens=lens, **known))
     assert tapped.known_length == "12,40.5,50,41,0.8" and tapped.baseline is None
-    assert options_of(*photographs, "file", ("K.txt",), **known).known_length is None
+    assert options_of(*photographs, CameraFields("file", ("K.txt",), **known)).known_length is None
 
 
 def test_what_a_visitor_left_out_or_gave_wrongly(photographs, monkeypatch):
@@ -101,12 +103,12 @@ def test_what_a_visitor_left_out_or_gave_wrongly(photographs, monkeypatch):
         (__file__, "file", "the left photograph must be an image file"),
     ):
         with pytest.raises(ValueError, match=said):
-            options_of(left, photographs[1], way)
+            options_of(left, photographs[1], CameraFields(way))
     with pytest.raises(ValueError, match="ends of the known length are two pixels: tap both"):
-        options_of(*photographs, "photographs", known_length=0.8, ends="3, 4")
+        options_of(*photographs, CameraFields("photographs", known_length=0.8, ends="3, 4"))
     monkeypatch.setattr(job, "MOST_MEGAPIXELS", 0.003)
     with pytest.raises(ValueError, match="at most 0.003 megapixels; got 64x48"):
-        options_of(*photographs, "file")
+        options_of(*photographs, CameraFields("file"))
 
 
 @pytest.mark.filterwarnings("ignore:.*has no unit")
@@ -118,7 +120,7 @@ def test_a_calibration_without_a_unit_needs_the_distance(photographs, priors, tm
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps({"fl_x": 60.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "frames": frames}))
     with pytest.raises(ValueError, match="has no unit: give the distance between the two cameras"):
-        run(options_of(*photographs, "file", (str(path),), prior="tiny"), priors)
+        run(options_of(*photographs, CameraFields("file", (str(path),)), prior="tiny"), priors)
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +132,8 @@ def priors(make_pipeline):
 
 @pytest.fixture(scope="module")
 def asked(photographs):
-    return options_of(*photographs, "numbers", (), 0.12, None, {"fx": 60.0}, prior="tiny", steps=1)
+    cameras = CameraFields("numbers", lens={"fx": 60.0}, baseline=0.12)
+    return options_of(*photographs, cameras, prior="tiny", steps=1)
 
 
 def run(options, priors):

@@ -27,7 +27,7 @@ from geodiff_plugin.jobs.lengths import spans_to_measure
 from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.plotting import grid
-from geodiff_plugin.pose.multiview import SolvedCapture, candidate_pairs, solve_capture
+from geodiff_plugin.pose.multiview import GivenFrames, SolvedCapture, candidate_pairs, solve_capture
 from geodiff_plugin.result.verdict import judge
 from geodiff_plugin.types import DepthFrame, Indicators
 from tests.cli.conftest import call
@@ -51,7 +51,8 @@ def grey(E: np.ndarray) -> np.ndarray:
 
 def solve(given: np.ndarray | None, images: list[np.ndarray] | None = None, **how: str) -> SolvedCapture:
     images = [grey(E) for E in TRUE] if images is None else images
-    return solve_capture(images, np.tile(K, (COUNT, 1, 1)), given, [SIZE] * COUNT, **how)
+    names = [str(number) for number in range(COUNT)]
+    return solve_capture(images, GivenFrames(names, np.tile(K, (COUNT, 1, 1)), given, [SIZE] * COUNT), **how)
 
 
 @lru_cache(maxsize=1)

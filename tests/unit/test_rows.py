@@ -94,6 +94,11 @@ def test_a_run_of_other_options_is_told_in_the_words_of_the_command():
     made = replace(BASE, out=Path("a")).as_json()
     assert changed_options(replace(BASE, out=Path("b"), engine="ray", workers=3), made) == []
     assert changed_options(replace(BASE, seed=3), made) == ["made with --seed 0 instead of 3"]
+    large = replace(BASE, resolution=512)
+    assert changed_options(large, made) == ["made with the default of --resolution instead of 512"]
+    assert changed_options(BASE, large.as_json()) == ["made with --resolution 512 instead of the default"]
+    del made["seed"]
+    assert changed_options(replace(BASE, seed=3), made) == [], "of an option that is newer nothing is known"
 
 
 class TestStore:
