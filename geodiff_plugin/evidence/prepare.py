@@ -18,6 +18,7 @@ from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.inputs import Inputs
 from geodiff_plugin.matching import Matches, clean
+from geodiff_plugin.matching.matches import read_above
 from geodiff_plugin.matching.rows import RowMatches, match_rectified
 from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.pose.mistakes import INVERSE
@@ -124,6 +125,5 @@ def _read_back(evidence: Evidence) -> None:
     """Fill the caches that wait for the device now, so that no step does."""
     if evidence.volume is not None:
         _ = evidence.volume.reach_m, evidence.volume.rectified
-    for target in (evidence.matches, evidence.points, evidence.reliable):
-        if target is not None:
-            _ = target.above(0.0), target.above(RELIABLE)
+    if (points := evidence.points) is not None:
+        read_above((points, 0.0), (points, RELIABLE))  # ``reliable_matches`` reads those of matches

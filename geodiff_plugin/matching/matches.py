@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin._kernels import launch_bound
 from geodiff_plugin.geometry import NEAREST_M, project
 
 #: The unit in which errors at points are measured, as a share of their median inverse depth.
@@ -80,10 +81,29 @@ class Matches:
         return replace(self, confidence=self.confidence * inside.view_as(self.confidence))
 
     def above(self, confidence: float) -> Tensor:
-        """Flat indices ``(P,)`` of one image's pixels above a confidence; cached, to wait for a GPU once."""
+        """Flat indices ``(P,)`` of one image's pixels above a confidence, in order; cached."""
         if confidence not in self._above:
-            self._above[confidence] = (self.confidence.flatten() > confidence).nonzero()[:, 0]
+            read_above((self, confidence))
         return self._above[confidence]
+
+
+def read_above(*wanted: tuple[Matches, float]) -> None:
+    """Fill the caches of ``Matches.above``, for matches on one device, which is waited for once in all."""
+    masks = [matches.confidence.flatten() > confidence for matches, confidence in wanted]
+    if launch_bound(masks[0]):
+        counts = torch.stack([mask.sum() for mask in masks]).tolist()
+        found = [_indices(mask, count) for mask, count in zip(masks, counts, strict=True)]
+    else:
+        found = [mask.nonzero()[:, 0] for mask in masks]
+    for (matches, confidence), indices in zip(wanted, found, strict=True):
+        matches._above[confidence] = indices
+
+
+def _indices(mask: Tensor, count: int) -> Tensor:
+    """As ``mask.nonzero()[:, 0]`` of a mask ``(N,)`` that is true ``count`` times, without waiting for it."""
+    place = torch.where(mask, mask.cumsum(0), 0)  # what is not there goes to place 0, which is cut off
+    indices = place.new_empty(count + 1)
+    return indices.scatter_(0, place, torch.arange(len(mask), device=mask.device))[1:]
 
 
 def points_to_matches(

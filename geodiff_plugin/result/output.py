@@ -36,9 +36,13 @@ def stack_results(
     ``history`` are the reports of its steps, ``remarks`` warnings that say nothing about one image alone,
     and ``extras`` further maps of the prior.
     """
-    maps = _read_out({name: _together(results, name) for name in MAPS}, as_numpy)
     over_prior = _together(results, "over_prior")
-    numbers: dict[str, Any] = dict(to_host(_numbers(results, over_prior)))
+    maps: dict[str, Any] = {name: _together(results, name) for name in MAPS}
+    further: dict[str, Any] = dict(extras or {})
+    read = to_host(_numbers(results, over_prior), *((maps, further) if as_numpy else ()))
+    numbers: dict[str, Any] = dict(read[0])
+    if as_numpy:
+        maps, further = map(_as_arrays, read[1:])
     K = torch.stack([result.K for result in results])
     poses, estimated = [result.evidence.pose for result in results], guidance.estimated
     output = MetricDepthOutput(
@@ -48,7 +52,7 @@ def stack_results(
         K=K.numpy() if as_numpy else K.to(results[0].depth_m.device),
         history=list(history),
         poses=[pose for pose in poses if pose is not None],
-        extras=_read_out(extras or {}, as_numpy),
+        extras=further,
         verdicts=[result.verdict for result in results],
         unit=guidance.unit,
         warnings=[*_warnings(results), *(() if estimated is None else estimated.warnings), *remarks],
@@ -81,19 +85,20 @@ def _numbers(results: Sequence[ImageResult], over_prior: Tensor | None) -> dict[
     return numbers
 
 
-def _read_out(maps: Mapping[str, Tensor | None], as_numpy: bool) -> dict[str, Any]:
-    """Maps as the user gets them: tensors, or arrays with the channels last."""
-    if not as_numpy:
-        return dict(maps)
-    known = to_host({name: x.permute(0, 2, 3, 1) for name, x in maps.items() if x is not None})
-    return {name: known[name].numpy() if name in known else None for name in maps}
+def _as_arrays(maps: Mapping[str, Tensor | None]) -> dict[str, np.ndarray | None]:
+    """Maps ``(N, C, H, W)`` as arrays with the channels last."""
+    return {name: None if x is None else x.permute(0, 2, 3, 1).numpy() for name, x in maps.items()}
 
 
-def to_host(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def to_host(*groups: Mapping[str, Tensor | None]) -> list[dict[str, Tensor | None]]:
     """Tensors on the CPU; those of a CUDA device are all copied before it is waited for, once."""
+    given = [x for group in groups for x in group.values() if x is not None]
     # Elsewhere a copy that is not waited for would be read too early.
-    copies = {name: x.to("cpu", non_blocking=x.is_cuda) for name, x in tensors.items()}
-    for device in {x.device for x in tensors.values() if x.is_cuda}:
+    copies = [
+        {name: None if x is None else x.to("cpu", non_blocking=x.is_cuda) for name, x in group.items()}
+        for group in groups
+    ]
+    for device in {x.device for x in given if x.is_cuda}:
         torch.cuda.current_stream(device).synchronize()
     return copies
 

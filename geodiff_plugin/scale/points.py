@@ -15,7 +15,7 @@ from torch import Tensor
 
 from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.matching.matches import UNIT
+from geodiff_plugin.matching.matches import UNIT, read_above
 from geodiff_plugin.scale.space import SPACES, MetricMap, Space
 
 #: Matches above this confidence are reliable: more likely right than wrong.
@@ -78,11 +78,11 @@ def depth_span(points: Matches) -> tuple[Tensor, Tensor]:
 
 def reliable_matches(matches: Matches) -> Matches | None:
     """Matches that are more likely right than wrong, in the form of points; ``None`` for too few."""
-    reliable = (matches.confidence > RELIABLE) & (matches.inverse_depth > matches.plane_step)
-    if int(reliable.sum()) < FEWEST_RELIABLE:
-        return None
-    unit = UNIT * matches.inverse_depth[reliable].median()
-    return replace(matches, confidence=reliable.float(), plane_step=unit)
+    likely = (matches.confidence > RELIABLE) & (matches.inverse_depth > matches.plane_step)
+    unit = UNIT * torch.where(likely, matches.inverse_depth, torch.nan).nanmedian()
+    reliable = replace(matches, confidence=likely.float(), plane_step=unit)
+    read_above((reliable, 0.0), (matches, 0.0), (matches, RELIABLE))  # these two are needed later
+    return reliable if len(reliable.above(0.0)) >= FEWEST_RELIABLE else None
 
 
 @torch.no_grad()

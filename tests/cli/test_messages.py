@@ -45,10 +45,10 @@ def test_a_defect_keeps_its_traceback_and_ctrl_c_is_a_line(monkeypatch, geodiff,
         raise ValueError("a defect")
 
     before = sorted(pair_files.folder.iterdir())
-    monkeypatch.setattr("geodiff_plugin.jobs.prior.load_guided_prior", broken)
+    monkeypatch.setattr("geodiff_plugin.jobs.prior.load_quiet_prior", broken)
     with pytest.raises(ValueError, match="a defect"):
         geodiff(*pair_files.command)
-    monkeypatch.setattr("geodiff_plugin.jobs.prior.load_guided_prior", stop)
+    monkeypatch.setattr("geodiff_plugin.jobs.prior.load_quiet_prior", stop)
     answer = geodiff(*pair_files.command)
     assert (answer.code, answer.out) == (130, "")
     assert answer.err == "geodiff: interrupted; the same command resumes\n"
@@ -57,7 +57,7 @@ def test_a_defect_keeps_its_traceback_and_ctrl_c_is_a_line(monkeypatch, geodiff,
 
 def test_warnings_are_sentences(monkeypatch, geodiff, pair_files):
     """Each one line before any weights load: alpha, an EXIF turn, a baseline in millimetres."""
-    monkeypatch.setattr("geodiff_plugin.jobs.prior.load_guided_prior", stop)
+    monkeypatch.setattr("geodiff_plugin.jobs.prior.load_quiet_prior", stop)
     Image.open(pair_files.left).convert("RGBA").save(pair_files.left)
     exif = Image.Exif()
     exif[0x0112] = 3

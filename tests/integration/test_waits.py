@@ -3,11 +3,16 @@
 import traceback
 from collections import Counter
 
+import numpy as np
 import pytest
 import torch
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from geodiff_plugin.matching import Matches
+from geodiff_plugin.result import output
+from geodiff_plugin.scale.points import RELIABLE, reliable_matches
 from tests.conftest import guided_call
 
 #: Operations whose result has a size, or is a number, that only the device knows.
@@ -53,3 +58,49 @@ def test_no_step_waits(pipe, textured_plane, monkeypatch, knobs):
     with reads:
         guided_call(pipe, textured_plane, knobs, num_inference_steps=2)
     assert set(reads.found) == ON_THE_CPU  # which shows that it counted
+
+
+class Reads(TorchFunctionMode):
+    """How often a number of a tensor is read by Python."""
+
+    NAMES = frozenset(("tolist", "item", "nonzero", "__bool__", "__int__", "__float__", "__index__"))
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        self.count += getattr(func, "__name__", "") in self.NAMES
+        return func(*args, **kwargs or {})
+
+
+@pytest.mark.parametrize(("seed", "least"), [(0, 0.3), (1, 0.99), (2, 1.0)])
+def test_where_matches_are_likely_is_read_once(seed, least, monkeypatch):
+    """As on a device; of many matches, of a few, and of none."""
+    monkeypatch.setattr("geodiff_plugin.matching.matches.launch_bound", lambda _: True)
+    drawn = np.random.default_rng(seed).random((2, 1, 40, 50), np.float32)
+    drawn[1][drawn[1] < least] = 0.0
+    matches = Matches(*torch.from_numpy(drawn), torch.tensor(0.02))
+    with Reads() as reads:
+        reliable = reliable_matches(matches)
+        places = [matches.above(0.0), matches.above(RELIABLE)]
+    assert reads.count == 1
+    for threshold, found in zip((0.0, RELIABLE), places, strict=True):
+        np.testing.assert_array_equal(found, np.flatnonzero(drawn[1] > threshold))
+    likely = np.flatnonzero((drawn[1] > RELIABLE) & (drawn[0] > np.float32(0.02)))
+    assert (reliable is None) == (len(likely) < 50)
+    if reliable is not None:
+        np.testing.assert_array_equal(reliable.above(0.0), likely)
+        middle = np.sort(drawn[0].ravel()[likely])[(len(likely) - 1) // 2]
+        np.testing.assert_allclose(reliable.plane_step, 0.01 * middle, rtol=1e-6)
+
+
+@pytest.mark.parametrize("output_type", ["np", "pt"])
+def test_maps_and_numbers_of_a_result_are_copied_together(output_type, pipe, textured_plane, monkeypatch):
+    calls, own = [], output.to_host
+    monkeypatch.setattr(output, "to_host", lambda *groups: calls.append(len(groups)) or own(*groups))
+    result = guided_call(pipe, textured_plane, num_inference_steps=2, output_type=output_type)
+    assert calls == [3 if output_type == "np" else 1]
+    kind, shape = (np.ndarray, (1, 48, 64, 1)) if output_type == "np" else (torch.Tensor, (1, 1, 48, 64))
+    assert isinstance(result.prediction, kind) and result.prediction.shape == shape
+    assert isinstance(result.scale, torch.Tensor)

@@ -51,7 +51,7 @@ def grey(E: np.ndarray) -> np.ndarray:
 
 def solve(given: np.ndarray | None, images: list[np.ndarray] | None = None, **how: str) -> SolvedCapture:
     images = [grey(E) for E in TRUE] if images is None else images
-    names = [str(number) for number in range(COUNT)]
+    names = [f"f{number}" for number in range(COUNT)]
     return solve_capture(images, GivenFrames(names, np.tile(K, (COUNT, 1, 1)), given, [SIZE] * COUNT), **how)
 
 
@@ -114,7 +114,7 @@ def test_a_blurred_frame_and_a_wrong_pose_are_named():
     images[4] = cv2.blur(images[4], (61, 61))
     given = GIVEN.copy()
     given[7, 1, 3] += 1.0
-    found = solve(given, images, names=[f"f{i}" for i in range(COUNT)])
+    found = solve(given, images)
     assert not found.connected[4] and found.connected.sum() == COUNT - 1
     assert any("1 of 10 frames" in note and "f4" in note for note in found.notes)
     assert any("f4: blurred" in note for note in found.notes)
