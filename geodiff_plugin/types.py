@@ -134,7 +134,7 @@ class StepReport:
 class Indicators:
     """Numbers of one image's run; NaN where unknown."""
 
-    confidence: float = math.nan  # mean of the confidence map, [0, 1]
+    confidence: float = math.nan  # mean of the confidence, [0, 1], also where depth is out of reach
     matched: float = math.nan  # share of the left image with a match that both views agree on, [0, 1]
     rank_correlation: float = math.nan  # of the prior's first map with matches or points, [-1, 1]
     spread: float = math.nan  # of the matched depths, log of their 95 % over their 5 % quantile
@@ -212,8 +212,8 @@ class MetricDepthOutput(BaseOutput):
         visible: boolean, in front of a right camera and inside its image; ``None`` without a right view.
         photometric_error: [0, 1] mean absolute difference between the left image and the warped right view
             that matches the pixel best; 0 where not visible; ``None`` without a right view.
-        confidence: [0, 1] probability that the depth is within 10 % of the truth; ``None`` without ``crisp``,
-            or without matches and points.
+        confidence: [0, 1] probability that the depth is within 10 % of the truth, 0 where there is no depth
+            (``valid``); ``None`` without ``crisp``, or without matches and points.
         support: [0, 1] how much matches and points, at the pixel or nearby on the same surface, determine the
             depth; ``None`` where ``confidence`` is.
         prior_error: ``(N,)`` error of the prior alone, standard deviation in log depth, estimated from
@@ -266,11 +266,23 @@ class MetricDepthOutput(BaseOutput):
             raise AttributeError("This output has no verdict: no guided call made it.")
         return min(self.verdicts, key=lambda v: ("not trusted", "not judged", "trusted").index(v.status))
 
+    @property
+    def valid(self) -> np.ndarray | torch.Tensor:
+        """Boolean, shaped as ``prediction``: where there is a depth.
+
+        Further away than the cameras can measure, where the views differ by less than 0.3 px, as in a sky,
+        there is none: ``prediction`` is that distance there, so that it can be shown, and ``confidence`` 0.
+        Clouds, meshes and other exports leave such pixels out.
+        """
+        positive = self.prediction > 0
+        return positive if self.confidence is None else positive & (self.confidence > 0)
+
     def into(self, K: np.ndarray, E: np.ndarray, size: tuple[int, int]) -> np.ndarray | torch.Tensor:
         """The depth as another camera sees it: of an infrared pair in the colour camera, say.
 
         Where several surfaces lie behind a pixel the nearest counts. Between the pixels of one surface, which
-        the prior makes dense, there are no holes; what the left camera does not see has no depth: 0.
+        the prior makes dense, there are no holes. What the left camera does not see has no depth, 0, nor has
+        what is not ``valid``.
 
         Args:
             K: ``(3, 3)`` pixels of that camera's image, without lens distortion.
@@ -288,10 +300,8 @@ class MetricDepthOutput(BaseOutput):
         if self.K is None:
             raise AttributeError("This output has no K: no guided call made it.")
         Ks = self.K if isinstance(self.K, np.ndarray) else self.K.numpy(force=True)
-        if isinstance(self.prediction, np.ndarray):
-            depths = self.prediction[..., 0]
-        else:
-            depths = self.prediction[:, 0].numpy(force=True)
+        known = self.prediction * self.valid
+        depths = known[..., 0] if isinstance(known, np.ndarray) else known[:, 0].numpy(force=True)
         pairs = zip(depths, Ks.astype(np.float64), strict=True)
         seen = np.stack([depth_in_camera(depth, K_left, camera) for depth, K_left in pairs])
         if isinstance(self.prediction, np.ndarray):

@@ -255,6 +255,25 @@ MUTANTS = [
         tests=(f"{UNIT}verdict.py", f"{UNIT}large_pictures.py"),
     ),
     *of(
+        "result/finish.py",
+        ("measured_here = depth_m < _farthest_m", "measured_here = depth_m <= _farthest_m"),
+        ("else max(reach_m, config.depth_range[1])", "else reach_m"),
+        tests=(f"{UNIT}out_of_reach.py",),
+    ),
+    *of(
+        "jobs/writing.py",
+        ('"depth_mm.png", depth_m * valid)', '"depth_mm.png", depth_m)'),
+        ("kept = valid & ~", "kept = ~"),
+        ("single_map(output.valid) & ~formats", "~formats"),
+        tests=(f"{UNIT}out_of_reach.py",),
+    ),
+    *of(
+        "types.py",
+        ("positive & (self.confidence > 0)", "positive & (self.confidence >= 0)"),
+        ("known = self.prediction * self.valid", "known = self.prediction"),
+        tests=(f"{UNIT}out_of_reach.py",),
+    ),
+    *of(
         "runtime/noise_levels.py",
         ("alpha_bar.sqrt(), (1.0 - alpha_bar).sqrt()", "alpha_bar.sqrt(), 1.0 - alpha_bar.sqrt()"),
         tests=("tests/parity/test_scheduler_parity.py",),

@@ -99,7 +99,7 @@ def _figures(job: PairResult) -> tuple[Figure, ...]:
     """Numbers for the banner; of a result that is not trusted only what is there, not how good it is."""
     output = job.run.output
     visible = None if output.visible is None else single_map(output.visible)
-    depth = depth_summary(single_map(output.prediction), visible)
+    depth = depth_summary(single_map(output.prediction * output.valid), visible)
     seconds = Figure(f"{sum(job.run.log.seconds.values()):.1f} s", "computing")
     if not output.verdict.trusted:
         return Figure(f"{depth['median_m']:.2f} m, unconfirmed", "median depth"), seconds

@@ -86,7 +86,7 @@ def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[s
 
 def _write_agreed(folder: Path, frame: DepthFrame, unit: str | None) -> None:
     write_depth_npy(folder / "depth.npy", frame.depth)
-    write_depth_mm(folder / "depth_mm.png", frame.depth)
+    write_depth_mm(folder / "depth_mm.png", frame.depth * (frame.confidence > 0))
     plotting.depth_figure(frame.depth, unit=unit).save(folder / "depth.png")
     for file, values in zip(AGREED[1:], (frame.confidence, frame.confirmed, frame.observers), strict=True):
         assert values is not None  # of agreement

@@ -60,13 +60,25 @@ def depth_bag(options: DepthOptions, *, tell: Tell = silent, progress: bool = Fa
     def results() -> Iterator[recordings.BagFrame]:
         for ref, (stamp, _) in zip(refs, pairs, strict=True):
             if report := read_report(frames / ref.name):
-                file, K = ("depth.npy", report["K"]) if camera is None else (INTO[0], camera.K)
-                depth_m = np.load(frames / ref.name / file, allow_pickle=False)
+                folder = frames / ref.name
+                K = report["K"] if camera is None else camera.K
+                depth_m = _valid_depth(folder) if camera is None else _loaded(folder / INTO[0])
                 yield recordings.BagFrame(stamp, depth_m, np.reshape(K, (3, 3)))
 
     frame_id = frame_id if options.into is None else frame_of_target(options.into)
     count = recordings.write_depth_bag(out, results(), frame_id, options.encoding)
     return BagResult(out, frames, count, rows)
+
+
+def _loaded(path: Path) -> np.ndarray:
+    values: np.ndarray = np.load(path, allow_pickle=False)
+    return values
+
+
+def _valid_depth(folder: Path) -> np.ndarray:
+    """The depth of a result's folder, ``(H, W)`` metres, 0 where its confidence is 0: there is none."""
+    depth_m, confidence = _loaded(folder / "depth.npy"), folder / "confidence.npy"
+    return depth_m * (_loaded(confidence) > 0) if confidence.is_file() else depth_m
 
 
 def _with_its_cameras(options: DepthOptions, folder: Path) -> tuple[DepthOptions, str]:

@@ -83,7 +83,8 @@ def write_pair(folder: OutFolder, run: PairRun, **entries: Any) -> PairResult:
             if inputs.undistorted:
                 write_undistorted(place, inputs.left)
             if options.into is not None:
-                depth_m, K = single_map(output.prediction), np.asarray(output.K)[0].astype(np.float64)
+                depth_m = single_map(output.prediction * output.valid)
+                K = np.asarray(output.K)[0].astype(np.float64)
                 report["into"] = write_into(place, depth_m, K, options.into)
             if options.export:
                 write_exports(place, output, inputs, options)

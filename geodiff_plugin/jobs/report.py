@@ -107,7 +107,7 @@ def build_report(run: PairRun) -> dict[str, Any]:
     cameras = guidance.inputs[0].K_left, used_poses(output, guidance)
     expected_m = expected_error(depth_m, *cameras, np.nan_to_num(output.verdict.indicators.scale_spread))
     report = {
-        "depth": depth_summary(depth_m, visible),
+        "depth": depth_summary(depth_m * single_map(output.valid), visible),
         "verdict": verdict_report(output),
         "photometric_error_mean": error,
         "expected_error_median_m": np.median(expected_m),

@@ -132,7 +132,7 @@ def result_columns(pair: GuidedPair) -> Row:
     depth_m, confidence = single_map(run.output.prediction), run.output.confidence
     named = ("near_m", "median_m", "far_m", "verdict", "codes", "seconds")
     return {name: told[name] for name in named} | {
-        "depth_mm": _png(depth_mm(depth_m)),
+        "depth_mm": _png(depth_mm(depth_m * single_map(run.output.valid))),
         "confidence": None if confidence is None else _png(_in_255ths(single_map(confidence))),
         "height": depth_m.shape[0],
         "width": depth_m.shape[1],

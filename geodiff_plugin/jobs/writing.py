@@ -27,7 +27,8 @@ def write_maps(
     """Write every file but exports and the report of the image ``left (H, W, 3)``; counts for the report."""
     depth_m, K = single_map(output.prediction).astype(np.float32), np.asarray(output.K)[0]
     formats.write_depth_npy(folder / "depth.npy", depth_m)
-    zeros = formats.write_depth_mm(folder / "depth_mm.png", depth_m)
+    valid = single_map(output.valid)
+    zeros = formats.write_depth_mm(folder / "depth_mm.png", depth_m * valid)
     plotting.depth_figure(depth_m, unit=output.unit).save(folder / "depth.png")
     maps = {name: np.asarray(extra)[0] for name, extra in output.extras.items()}
     of_call = {name: getattr(output, name) for name in ("photometric_error", "uncertainty", "confidence")}
@@ -43,13 +44,14 @@ def write_maps(
         plotting.share_figure(maps["confidence"], "confidence", 1.0).save(folder / "confidence.png")
         doubtful = maps["confidence"] < min_confidence
     plotting.overview(left, depth_m, maps.get("confidence"), error, output.unit).save(folder / "overview.png")
-    kept = ~(flying | doubtful)
+    kept = valid & ~(flying | doubtful)
     points = formats.write_ply(folder / "cloud.ply", depth_m, left, K, valid=kept, unit=output.unit)
     return {
         "depth_mm_zero_pixels": zeros,
         "cloud_points": points,
         "flying_points": int(flying.sum()),
         "doubtful_points": int(doubtful.sum()),
+        "points_out_of_reach": int((~valid).sum()),
     }
 
 
@@ -83,9 +85,9 @@ def cameras_of(
 def pixels_of(
     output: MetricDepthOutput, left: np.ndarray, least_confidence: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What ``make_cloud`` and ``make_mesh`` take: pixels of at least this confidence that do not fly."""
+    """What ``make_cloud`` and ``make_mesh`` take: valid pixels of this confidence or more that do not fly."""
     depth_m = single_map(output.prediction)
-    keep = ~formats.flying_points(depth_m)
+    keep = single_map(output.valid) & ~formats.flying_points(depth_m)
     if output.confidence is not None:
         keep &= single_map(output.confidence) >= least_confidence
     return depth_m, left, np.asarray(output.K)[0].astype(np.float64), keep

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -100,7 +101,7 @@ def finish(
     K = resize_intrinsics(native.K_left[None], native.size, image_size(depth_m))
     refined = refine(evidence, members, depth_m, left_01, options.config) if options.config.crisp else None
     if refined is not None:
-        depth_m = _within_reach(refined.depth_m, evidence, options.config)
+        depth_m = refined.depth_m.clamp(max=_farthest_m(evidence, options.config))
     if uncertainty is not None:
         uncertainty = uncertainty.to(depth_m)
         if refined is not None:
@@ -116,7 +117,8 @@ def finish(
     numbers = read_numbers(_numbers(evidence, members, measured, options))
     verdict = judge(_indicators(evidence, numbers, options))
     if confidence is not None:
-        confidence = confidence * points_agreement(verdict.indicators)
+        measured_here = depth_m < _farthest_m(evidence, options.config)
+        confidence = confidence * points_agreement(verdict.indicators) * measured_here
     return ImageResult(
         evidence=evidence,
         depth_m=depth_m,
@@ -154,16 +156,17 @@ def _within_range(depth_m: Tensor, members: Sequence[Member]) -> Tensor:
     return depth_m.clamp_(near_m.to(depth_m).amin(0, keepdim=True), far_m.to(depth_m).amax(0, keepdim=True))
 
 
-def _within_reach(depth_m: Tensor, evidence: Evidence, config: GuidanceConfig) -> Tensor:
-    """A map clamped to what its cameras can measure, or to the range that the user gave, if that is further.
+def _farthest_m(evidence: Evidence, config: GuidanceConfig) -> float:
+    """Metres that a result is clamped to, and from which on there is no depth: confidence is 0.
 
-    Matches at infinity pull a fit without bound, in log depth, wherever nothing else holds it.
+    It is what the cameras can measure, or the far end of the range that the user gave, if that is further;
+    infinity without a second view. Matches at infinity pull a fit without bound, in log depth, wherever
+    nothing else holds it.
     """
     if evidence.volume is None:
-        return depth_m
+        return math.inf
     _, reach_m = evidence.volume.reach_m
-    given_m = 0.0 if config.depth_range is None else config.depth_range[1]
-    return depth_m.clamp(max=max(reach_m, given_m))
+    return reach_m if config.depth_range is None else max(reach_m, config.depth_range[1])
 
 
 def _mean(members: Sequence[Member], name: str) -> Tensor | None:

@@ -78,5 +78,7 @@ class TrustOptions(EvalOptions):
     limit: int | None = count_of(None, "The first N real pairs alone.")
     rendered: int = count_of(0, "Rendered pairs.", 0, 10**6)
     width: int = count_of(512, "Width of the rendered pairs, pixels.", 64, 8192)
-    kinds: tuple[str, ...] = listed((), "Comma-separated kinds of wrong calibration; all by default.")
+    kinds: tuple[str, ...] = listed(
+        (), 'Comma-separated kinds; all wrong ones by default, "right" for no wrong one.'
+    )
     out: Path = out_folder("geodiff-trust")

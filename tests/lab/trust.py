@@ -25,7 +25,9 @@ from geodiff_plugin.evaluation.experiment import Experiment, Page, run_experimen
 from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.jobs.journal import Item, Record
-from geodiff_plugin.types import DepthFrame
+from geodiff_plugin.jobs.report import used_poses
+from geodiff_plugin.result.confidence import RIGHT_WITHIN, expected_error
+from geodiff_plugin.types import DepthFrame, MetricDepthOutput
 from tests.lab.options import TrustOptions
 
 #: A depth further off than this, as a share of the truth at the median pixel, is wrong enough to be told.
@@ -207,7 +209,24 @@ def _measure(ref: SampleRef, other: SampleRef, kind: str, read: Any, pipe: Any, 
     off = None if kind == "swapped" else float(np.median(errors))  # the truth is the other image's there
     signs = {name: None if value != value else value for name, value in asdict(verdict.indicators).items()}
     said += [*verdict.reasons, *verdict.remarks]
-    return head | {"status": verdict.status, "said": said, "off": off, "signs": signs}
+    head |= {"codes": [message.code for message in verdict.reasons], "signs": signs}
+    head |= {"status": verdict.status, "said": said, "off": off}
+    return head | _promise(sample, out, guidance, errors)
+
+
+def _promise(
+    sample: StereoSample, out: MetricDepthOutput, guidance: GeometryGuidance, errors: np.ndarray
+) -> Record:
+    """What a result promises where there is truth, and what it keeps; ``errors`` are shares of the truth."""
+    depth_m, confidence = out.prediction[0, ..., 0], out.confidence
+    spread = np.nan_to_num(out.verdict.indicators.scale_spread)
+    expected_m = expected_error(depth_m, sample.K_left, used_poses(out, guidance), spread)
+    return {
+        "abs_rel": float(errors.mean()),
+        "kept": float((errors < RIGHT_WITHIN).mean()),
+        "promised": None if confidence is None else float(confidence[0, ..., 0][sample.valid].mean()),
+        "expected": float(np.median((expected_m / depth_m)[sample.valid])),
+    }
 
 
 def _share(group: Sequence[Record], *, told: bool = True, off: bool = False) -> str:
@@ -278,13 +297,13 @@ def _cells(
 def run(name: str, options: TrustOptions) -> Page | None:
     """Measure, write ``trust.jsonl`` and the table; errors as ``run_experiment``."""
     for kind in options.kinds:
-        check_choice(kind, "--kinds", WRONG)
-    wrong = options.kinds or WRONG
-    right = RIGHT if any(KINDS[kind].points for kind in wrong) else RIGHT[:1]
+        check_choice(kind, "--kinds", KINDS)
+    asked = options.kinds or WRONG
+    right = RIGHT if any(KINDS[kind].points for kind in asked) else RIGHT[:1]
     pairs = _real_and_rendered(options)
     if "unrelated" in options.kinds and any(len(refs) == 1 for refs in pairs.values()):
         bad_value("--kinds", "without 'unrelated' where a pair is alone", "it", "Give two pairs or more.")
-    cells = _cells(pairs, (*right, *wrong), options.settings, PriorCache())
+    cells = _cells(pairs, tuple(dict.fromkeys((*right, *asked))), options.settings, PriorCache())
 
     def page_tables(records: list[Record]) -> list[Table]:
         return [_table(source, group) for source, group in tables.grouped(records, "group").items()]
