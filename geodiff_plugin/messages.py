@@ -145,6 +145,13 @@ MESSAGES: dict[str, MessageKind] = {
         cause="Only one K was given for two parallel cameras.",
         cure="Give the right camera's matrix (K_right, --K-right) or its cx (--cx-right).",
     ),
+    "camera.other-centre": MessageKind(
+        "The right camera's cx is not the left one's",
+        cause="Only one K was given for two parallel cameras, and under it things lie behind infinity.",
+        cure="Give the right camera's matrix (K_right, --K-right) or its cx (--cx-right). If both are alike, "
+        "check E and the right image.",
+        forbids_trust=True,
+    ),
     "camera.principal-point": MessageKind(
         "The principal point is at an unusual place",
         cause="K belongs to an image of another size.",

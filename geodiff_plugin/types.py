@@ -83,6 +83,7 @@ class PoseReport:
     straightened_px: tuple[float, ...] = ()  # root mean square displacement of the right images; 0 for none
     scale_spread: float | None = None  # relative, of the scale of refined poses; None for measured baselines
     behind_infinity: float = math.nan  # share of the matches at which the rays of the poses as used diverge
+    behind_px: float = math.nan  # how far behind infinity the farthest of them lie; 0 where hardly any do
     distortion: float = math.nan  # radial coefficient k1 that both pictures still have for certain
     warnings: tuple[Message, ...] = ()
 
@@ -140,6 +141,7 @@ class Indicators:
     spread: float = math.nan  # of the matched depths, log of their 95 % over their 5 % quantile
     points_ratio: float = math.nan  # median of known points over matched depths at the same places
     points_off: float = math.nan  # share of the points that differ from the matches by 1.2 or more
+    centre_assumed: bool = False  # the right camera's cx is assumed to be the left one's
     points: int = 0  # number of known depths within the image
     cover: float = 0.0  # share of 8x8 equal parts of the image in which they lie
     range_given: bool = False  # the user gave the range of depths
@@ -153,6 +155,7 @@ class Indicators:
     given_px: float = math.nan  # the same distance under the poses as given
     scale_spread: float = math.nan  # relative standard deviation of a refined pose's scale, if in metres
     behind_infinity: float = math.nan  # share of the matches at which the two cameras' rays diverge
+    behind_px: float = math.nan  # how far behind infinity the farthest lie, pixels of the left image
     distortion: float = math.nan  # k1 that both pictures still have for certain
     off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
     doubts: tuple[Message, ...] = ()  # warnings about the input, each of which forbids trust

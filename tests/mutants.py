@@ -256,7 +256,7 @@ MUTANTS = [
     ),
     *of(
         "result/finish.py",
-        ("measured_here = depth_m < _farthest_m", "measured_here = depth_m <= _farthest_m"),
+        ("(depth_m < _farthest_m", "(depth_m <= _farthest_m"),
         ("else max(reach_m, config.depth_range[1])", "else reach_m"),
         tests=(f"{UNIT}out_of_reach.py",),
     ),
@@ -354,10 +354,10 @@ MUTANTS = [
         tests=CAPTURES,
     ),
     *of(
-        "result/confidence.py",
-        ("(depth_m[rows] - E[2, 3]) ** 2", "(depth_m[rows] + E[2, 3]) ** 2"),
+        "result/misfit.py",
+        ("(z_m - E[2, 3]) ** 2", "(z_m + E[2, 3]) ** 2"),
         ("E[0, 3] - ray_x * E[2, 3]", "E[0, 3] + ray_x * E[2, 3]"),
-        ("scale_spread * depth_m[rows])", "scale_spread)"),
+        ("scale_spread * z_m)", "scale_spread)"),
         tests=CAPTURES,
     ),
     *of("result/voting.py", ("+ 0.5) * (columns / width) - 0.5", ") * (columns / width)"), tests=CAPTURES),

@@ -31,8 +31,8 @@ from geodiff_plugin.types import Rig
 SAME_CENTRE = Message(
     "camera.same-centre",
     "The right camera's cx is assumed to be the left one's. If it is not, every depth is off: each pixel of "
-    "difference (doffs) shifts all disparities by one. Give the right camera's cx, which is cx + doffs "
-    "(K_right, or --cx-right).",
+    "difference (doffs) shifts all disparities by one, which the pictures show only where it puts things "
+    "behind infinity. Give the right camera's cx, which is cx + doffs (K_right, or --cx-right).",
 )
 #: Cosine of the angle below which two cameras count as parallel.
 PARALLEL = 0.9999

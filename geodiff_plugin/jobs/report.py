@@ -16,7 +16,7 @@ from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats.out import REPORT
 from geodiff_plugin.jobs.records import PairRun
 from geodiff_plugin.messages import Message, as_records
-from geodiff_plugin.result.confidence import expected_error
+from geodiff_plugin.result.misfit import expected_error, misfit_of
 from geodiff_plugin.result.standing import standing_words
 from geodiff_plugin.runtime.machine import versions
 from geodiff_plugin.types import UNTESTED, MetricDepthOutput
@@ -105,7 +105,9 @@ def build_report(run: PairRun) -> dict[str, Any]:
     spread = output.uncertainty
     names = ("K", "scale", "shift", "global_scale", "prior_scale", "prior_error", "unit", "assumed")
     cameras = guidance.inputs[0].K_left, used_poses(output, guidance)
-    expected_m = expected_error(depth_m, *cameras, np.nan_to_num(output.verdict.indicators.scale_spread))
+    found = output.verdict.indicators
+    misfit = misfit_of(found, depth_m.shape)
+    expected_m = expected_error(depth_m, *cameras, np.nan_to_num(found.scale_spread), misfit)
     report = {
         "depth": depth_summary(depth_m * single_map(output.valid), visible),
         "verdict": verdict_report(output),

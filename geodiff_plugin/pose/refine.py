@@ -52,8 +52,9 @@ _MOST_SHIFT = 0.8
 LENGTH_SPREAD = 0.15
 #: The same of the scene's median depth, measured on the same pairs.
 DEPTH_SPREAD = 0.05
-# The user is warned if the pose that fits best changes log depth by more than this, in the median.
-_MOST_SPREAD = 0.13
+# A pose is not determined if the one that fits best changes log depth by more than this, in the median. It did
+# by up to .135 for right pairs, and by .17 to .64 where the yaw of E was off by a degree.
+_MOST_SPREAD = 0.15
 # Straightening: residual above which a match counts for less, pixels.
 _BENT_PX = 0.5
 # Pull of its 20 coefficients towards 0, in matches.
@@ -126,7 +127,8 @@ def refine_views(
     fits = not (before > fits_px).any()
     near = given if fits else nearby_poses(sparse, given, before)
     distortion = remaining_distortion(sparse.view(0), given[0])
-    report = replace(report, behind_infinity=behind_infinity(sparse, given), distortion=distortion)
+    behind = behind_infinity(sparse, given)
+    report = replace(report, behind_infinity=behind.share, behind_px=behind.px, distortion=distortion)
     if mistakes := _messages(sparse, find_mistake, given, near):
         return tuple(rights), replace(report, status="mistaken", warnings=mistakes)
     if fits:
@@ -171,12 +173,14 @@ def _refined(misfit: _Misfit, report: PoseReport) -> _Refined:
     ]
     pairs = zip(tracks.right_px, bends, strict=True)
     straight = np.stack([px if bend is None else px + bend.at(px) for px, bend in pairs])
+    behind = behind_infinity(tracks, Ts)
     report = replace(
         report,
         status="refined",
         warnings=_refined_misfit(before, after, worst, misfit.rig) + doubts,
         scale_spread=spread,
-        behind_infinity=behind_infinity(tracks, Ts),
+        behind_infinity=behind.share,
+        behind_px=behind.px,
         E=_as_E(Ts),
         residual_px=tuple(median_residuals(replace(tracks, right_px=straight), Ts).tolist()),
         straightened_px=tuple(0.0 if bend is None else bend.rms_px for bend in bends),

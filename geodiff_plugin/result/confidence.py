@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -14,9 +13,6 @@ from geodiff_plugin._strips import STRIP_PIXELS, row_strips
 from geodiff_plugin.algorithm.terms import match_exposure
 from geodiff_plugin.geometry import as_fine_as, image_size, warp_right_to_left
 from geodiff_plugin.types import CameraView
-
-#: Standard deviation of a good match, pixels of the left image.
-MATCH_NOISE_PX = 0.25
 
 #: Confidence is the probability of a relative error below this.
 RIGHT_WITHIN = 0.1
@@ -97,32 +93,6 @@ def depth_confidence(
         evidence = depth_evidence(*shown, *further)
         confidence[:, :, rows] = torch.sigmoid((weights * evidence).sum(1, keepdim=True))
     return confidence
-
-
-def expected_error(
-    depth_m: np.ndarray, K_left: np.ndarray, poses: Sequence[np.ndarray], scale_spread: float = 0.0
-) -> np.ndarray:
-    """Standard error of a matched depth by geometry alone, ``(H, W)`` metres: ``z^2 sigma_d / (f b)``.
-
-    For a general pose ``(z - t_z)^2 sigma_d / |f (t_xy - r_xy t_z)|``, with the pixel's ray ``r`` and the
-    right camera's centre ``t``; the least over ``poses (4, 4)``. Rotations do not change it. A relative
-    error ``scale_spread`` of the poses' length adds to it.
-    """
-    height, width = depth_m.shape
-    error_m = np.empty((height, width))
-    ray_x = (np.arange(width) - K_left[0, 2]) / K_left[0, 0]
-    for rows in row_strips(height, width):
-        ray_y = (np.arange(rows.start, rows.stop)[:, None] - K_left[1, 2]) / K_left[1, 1]
-        best = np.full((rows.stop - rows.start, width), np.inf)
-        for E in poses:
-            # pixels times metres
-            moved_x = K_left[0, 0] * (E[0, 3] - ray_x * E[2, 3])
-            moved_y = K_left[1, 1] * (E[1, 3] - ray_y * E[2, 3])
-            with np.errstate(divide="ignore"):
-                error = (depth_m[rows] - E[2, 3]) ** 2 * MATCH_NOISE_PX / np.hypot(moved_x, moved_y)
-            best = np.minimum(best, error)
-        error_m[rows] = np.hypot(best, scale_spread * depth_m[rows])
-    return error_m
 
 
 def reprojection(

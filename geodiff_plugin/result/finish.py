@@ -26,6 +26,7 @@ from geodiff_plugin.result.confidence import depth_confidence, determined, repro
 from geodiff_plugin.result.ensemble import ensemble_metric, median, spread_around
 from geodiff_plugin.result.flattening import flatten
 from geodiff_plugin.result.indicators import indicators_of, measure_indicators, read_numbers
+from geodiff_plugin.result.misfit import misfit_of, share_left
 from geodiff_plugin.result.verdict import judge, points_agreement
 from geodiff_plugin.result.voting import vote_depth
 from geodiff_plugin.scale.points import order_agreement
@@ -44,6 +45,7 @@ class ResultOptions:
     reduction: str = "median"  # of an ensemble, or ``"mean"``
     has_unit: bool = True  # whether lengths are in metres
     doubts: tuple[Message, ...] = ()  # warnings about the input, each of which forbids trust
+    centre_assumed: bool = False  # the right camera's cx is assumed to be the left one's
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +119,7 @@ def finish(
     numbers = read_numbers(_numbers(evidence, members, measured, options))
     verdict = judge(_indicators(evidence, numbers, options))
     if confidence is not None:
-        measured_here = depth_m < _farthest_m(evidence, options.config)
-        confidence = confidence * points_agreement(verdict.indicators) * measured_here
+        confidence = confidence * _share_kept(evidence, depth_m, K[0], verdict.indicators, options.config)
     return ImageResult(
         evidence=evidence,
         depth_m=depth_m,
@@ -137,6 +138,15 @@ def finish(
         prior_error=prior_error,
         over_prior=measured.over_prior,
     )
+
+
+def _share_kept(
+    evidence: Evidence, depth_m: Tensor, K: Tensor, found: Indicators, config: GuidanceConfig
+) -> Tensor:
+    """Share ``(1, 1, H, W)`` of a confidence that stays by what its whole run shows; 0 where no depth is."""
+    misfit = misfit_of(found, evidence.native.size)
+    share = points_agreement(found) * share_left(depth_m, K, evidence.native.views, misfit)
+    return share * (depth_m < _farthest_m(evidence, config))
 
 
 def _unseen(depth_m: Tensor) -> tuple[Tensor, Tensor]:
@@ -296,6 +306,7 @@ def _indicators(evidence: Evidence, numbers: Mapping[str, float], options: Resul
         options.has_unit,
         on_edge=on_edge,
         doubts=options.doubts,
+        centre_assumed=options.centre_assumed,
         range_given=options.config.depth_range is not None,
         **further,
     )

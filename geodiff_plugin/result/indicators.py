@@ -15,6 +15,7 @@ from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.geometry import image_size, is_rectified
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.pose.mistakes import INVERSE
+from geodiff_plugin.pose.tracks import LONG_SIDE
 from geodiff_plugin.types import Indicators, PosedViews
 
 #: Matches above this confidence count.
@@ -35,6 +36,11 @@ MOST_SORTED = 1 << 22
 FLAT = 0.2
 #: A point that differs from the matches by this factor contradicts them (log).
 POINTS_WRONG = math.log(1.2)
+
+
+def pixels_of_matches(size: tuple[int, int]) -> float:
+    """Pixels of a left image of ``size`` ``(H, W)`` in a pixel of the grid that poses are checked on."""
+    return max(1.0, max(size) / LONG_SIDE)
 
 
 def read_numbers(numbers: Mapping[str, Tensor]) -> dict[str, float]:
@@ -134,6 +140,7 @@ def indicators_of(
         for name, residuals in (("epipolar_px", pose.residual_px), ("given_px", pose.residual_px_given)):
             known[name] = max((px for px in residuals if not math.isnan(px)), default=math.nan)
         known |= {"behind_infinity": pose.behind_infinity, "distortion": pose.distortion}
+        known["behind_px"] = pose.behind_px * pixels_of_matches(native.size)
         known["mistakes"] = tuple(m for m in pose.warnings if m.forbids_trust and m.code != INVERSE.code)
     if native.views and has_unit:
         known["scale_spread"] = (pose and pose.scale_spread) or math.nan

@@ -197,6 +197,10 @@ def _behind_infinity(found: Indicators) -> bool:
     return found.behind_infinity > MOST_BEHIND and not named
 
 
+def _other_centre(found: Indicators) -> bool:
+    return _behind_infinity(found) and found.centre_assumed
+
+
 def _scale_uncertain(found: Indicators) -> bool:
     return found.scale_spread > MOST_SCALE_SPREAD and found.points < LEAST_POINTS
 
@@ -266,6 +270,15 @@ def _why_behind(found: Indicators) -> str:
         "cameras diverge. Likely causes: another cx of the right camera than K says (give K_right, or "
         "--cx-right), a wrong rotation in E, a right image that was cropped or stretched, or things that "
         "moved."
+    )
+
+
+def _why_other_centre(found: Indicators) -> str:
+    return (
+        f"{100 * found.behind_infinity:.0f} % of the matches lie behind infinity, where the rays of the two "
+        "cameras diverge: the right camera's cx, which is assumed to be the left one's, seems to differ from "
+        f"it by {found.behind_px:.0f} px or more. Give its K or cx (K_right, or --cx-right). If both are "
+        "alike, E has a wrong rotation, the right image was cropped or stretched, or things moved."
     )
 
 
@@ -375,7 +388,12 @@ REASONS = (
             "image of something else?"
         ),
     ),
-    Rule("views.behind-infinity", _behind_infinity, _why_behind),
+    Rule("camera.other-centre", _other_centre, _why_other_centre),
+    Rule(
+        "views.behind-infinity",
+        lambda found: _behind_infinity(found) and not found.centre_assumed,
+        _why_behind,
+    ),
     Rule("views.distorted", lambda found: abs(found.distortion) > MOST_DISTORTION, _why_distorted),
     Rule("pose.off-lines", lambda found: found.epipolar_px > EPIPOLAR_WRONG, _why_off_lines),
     Rule("views.disagree", _views_disagree, _why_disagreement),

@@ -17,7 +17,7 @@ from geodiff_plugin.algorithm.schedule import Schedule, make_schedule
 from geodiff_plugin.algorithm.state import Trajectory
 from geodiff_plugin.algorithm.step import guided_step
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.evidence.guidance import SAME_CENTRE, GeometryGuidance
 from geodiff_plugin.messages import Message
 from geodiff_plugin.result.finish import ResultOptions, finish
 from geodiff_plugin.result.output import stack_results
@@ -131,6 +131,7 @@ class GuidedRun:
             reduction=(call["ensembling_kwargs"] or {}).get("reduction", "median"),
             has_unit=guidance.unit is not None,
             doubts=tuple(message for message in warned if message.forbids_trust),
+            centre_assumed=any(message.code == SAME_CENTRE.code for message in guidance.assumed),
         )
         spreads = [None] * count if stock.uncertainty is None else stock.uncertainty.split(1)
         of_images = zip(self._evidence(), members, stock.prediction.split(1), spreads, strict=True)

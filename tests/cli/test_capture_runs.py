@@ -19,7 +19,7 @@ pytest.importorskip("pycolmap")
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.formats.out import FOLDER_LOCK, PARTIAL, working_in
 from geodiff_plugin.jobs.memory import fitting_memory
-from geodiff_plugin.result.confidence import MATCH_NOISE_PX, expected_error
+from geodiff_plugin.result.misfit import MATCH_NOISE_PX, expected_error
 from tests.cli.conftest import call
 from tests.unit.capture_room import render, walk, write_transforms
 

@@ -26,15 +26,17 @@ from geodiff_plugin.evaluation.tables import CellOf, Table, count_of_pairs
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.jobs.journal import Item, Record
 from geodiff_plugin.jobs.report import used_poses
-from geodiff_plugin.result.confidence import RIGHT_WITHIN, expected_error
+from geodiff_plugin.result.confidence import RIGHT_WITHIN
+from geodiff_plugin.result.misfit import expected_error, misfit_of
 from geodiff_plugin.types import DepthFrame, MetricDepthOutput
 from tests.lab.options import TrustOptions
 
 #: A depth further off than this, as a share of the truth at the median pixel, is wrong enough to be told.
 OFF = 0.2
 TRUST_NOTE = (
-    "Median error of the depth as a share of the truth; left and right exchanged, there is no truth. A wrong "
-    "focal length of a rectified pair scales the depth and changes nothing else: two views cannot show it."
+    "Errors of the depth as shares of the truth; left and right exchanged, there is no truth. A wrong focal "
+    "length of a rectified pair scales the depth and changes nothing else: two views cannot show it. "
+    "Confidence and expected error, as a share of the depth and its median, are those of pixels with truth."
 )
 #: Coefficient k1 of the distortion that is not removed.
 BARREL = -0.25
@@ -211,7 +213,7 @@ def _measure(ref: SampleRef, other: SampleRef, kind: str, read: Any, pipe: Any, 
     said += [*verdict.reasons, *verdict.remarks]
     head |= {"codes": [message.code for message in verdict.reasons], "signs": signs}
     head |= {"status": verdict.status, "said": said, "off": off}
-    return head | _promise(sample, out, guidance, errors)
+    return head if off is None else head | _promise(sample, out, guidance, errors)
 
 
 def _promise(
@@ -219,8 +221,9 @@ def _promise(
 ) -> Record:
     """What a result promises where there is truth, and what it keeps; ``errors`` are shares of the truth."""
     depth_m, confidence = out.prediction[0, ..., 0], out.confidence
-    spread = np.nan_to_num(out.verdict.indicators.scale_spread)
-    expected_m = expected_error(depth_m, sample.K_left, used_poses(out, guidance), spread)
+    found = out.verdict.indicators
+    errors_of = np.nan_to_num(found.scale_spread), misfit_of(found, depth_m.shape)
+    expected_m = expected_error(depth_m, sample.K_left, used_poses(out, guidance), *errors_of)
     return {
         "abs_rel": float(errors.mean()),
         "kept": float((errors < RIGHT_WITHIN).mean()),
@@ -241,9 +244,18 @@ def _median(group: Sequence[Record]) -> str:
     return f"{np.median(known):.2f}" if known else "-"
 
 
+def _mean_of(name: str, group: Sequence[Record]) -> str:
+    """Mean of what was measured against the truth; an AbsRel above 10 counts as 10."""
+    return tables.mean_cell((None if (x := r.get(name)) is None else min(x, 10.0) for r in group), 2)
+
+
 _COLUMNS: dict[str, CellOf] = {
     "given as": lambda group: KINDS[group[0]["kind"]].title,
     "median error": _median,
+    "AbsRel": partial(_mean_of, "abs_rel"),
+    "within 10 %": partial(_mean_of, "kept"),
+    "confidence": partial(_mean_of, "promised"),
+    "expected error": partial(_mean_of, "expected"),
     "not trusted": partial(_share, told=False),
     "anything said": _share,
     f"said, of those > {OFF:.0%} off": partial(_share, off=True),
@@ -259,7 +271,8 @@ def _table(source: str, records: Sequence[Record]) -> Table:
     # Rectified rows stay rows under any focal length.
     seen = [record for record in wrong if not (record["rectified"] and record["kind"].startswith("K-"))]
     sums = {"all wrong ones": wrong, "without focal lengths of rectified pairs": seen}
-    more = ((name, "", "", "", _share(group, off=True)) for name, group in sums.items())
+    empty = [""] * (len(_COLUMNS) - 2)
+    more = ((name, *empty, _share(group, off=True)) for name, group in sums.items())
     return replace(table, rows=(*table.rows, *more))
 
 

@@ -19,8 +19,8 @@ from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.pose.multiview import SolvedCapture, _scaled
 from geodiff_plugin.pose.tracks import grey_image, grey_views
-from geodiff_plugin.result.confidence import expected_error
 from geodiff_plugin.result.indicators import measure_indicators
+from geodiff_plugin.result.misfit import expected_error
 from geodiff_plugin.result.output import _in_the_priors_metres
 from geodiff_plugin.result.voting import _enlarged
 from geodiff_plugin.types import CameraView, MetricDepthOutput, PosedViews

@@ -19,7 +19,7 @@ from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import Matches, known_share, rows
 from geodiff_plugin.matching.rows import match_rows
 from geodiff_plugin.result import voting
-from geodiff_plugin.result.confidence import MATCH_NOISE_PX, expected_error
+from geodiff_plugin.result.misfit import MATCH_NOISE_PX, expected_error
 from geodiff_plugin.result.voting import vote_depth
 from geodiff_plugin.types import CameraView, PosedViews
 

@@ -77,31 +77,64 @@ def test_bags_and_frames_of_captures_leave_it_out(tmp_path):
     assert (np.load(tmp_path / "depth.npy")[FAR] == REACH_M).all()
 
 
-@pytest.mark.parametrize("shift", [0, 3])
-def test_a_sky_has_none_and_that_makes_no_result_less_trusted(make_oracle, shift):
-    """A sky that shifts by nothing between the views, or by what can be measured, above two walls."""
-    noise = np.random.default_rng(0).random((96, 152, 3), np.float32)
+CAMERA = np.array([[120.0, 0, 63.5], [0, 120.0, 47.5], [0, 0, 1]])
+BASELINE_M = 0.1
+
+
+def pair_of_shifts(*shifts_px: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Left and right picture of walls one above the other, and the pixels that each row shifts between them."""
+    noise = np.random.default_rng(0).random((96, 168, 3), np.float32)
     scene = cv2.GaussianBlur(noise, (0, 0), 1.0)
     scene = (scene - scene.min()) / np.ptp(scene)
-    inverse = np.repeat([shift, 8, 14], [40, 28, 28])[:, None] * np.ones((1, 128), np.float32)
-    left = scene[:, 8:136]
-    right = np.stack([row[8 + int(px) : 136 + int(px)] for row, px in zip(scene, inverse[:, 0], strict=True)])
-    camera, E = np.array([[120.0, 0, 63.5], [0, 120.0, 47.5], [0, 0, 1]]), np.eye(4)
-    E[0, 3] = 0.1
-    pipe = enable_geometry_guidance(make_oracle((inverse - inverse.min()) / np.ptp(inverse), "disparity"))
+    shifts = np.repeat(shifts_px, 96 // len(shifts_px))
+    right = np.stack([row[16 + px : 144 + px] for row, px in zip(scene, shifts, strict=True)])
+    return scene[:, 16:144], right, shifts
 
-    def run(**knobs):
-        return pipe(left, guidance=GeometryGuidance(right, (camera, camera), E, inner_steps=0, **knobs))
 
-    reach_m = 120 * 0.1 / 0.3
-    out = run()
+@pytest.fixture
+def run(make_oracle):
+    """One guided call on a pair, by a prior that knows near from far."""
+
+    def call(left, right, order, K=(CAMERA, CAMERA), **knobs):
+        relative = (order - order.min()) / np.ptp(order)
+        relative = np.repeat(relative[:, None], 128, 1).astype(np.float32)
+        E = np.eye(4)
+        E[0, 3] = BASELINE_M
+        pipe = enable_geometry_guidance(make_oracle(relative, "disparity"))
+        return pipe(left, guidance=GeometryGuidance(right, K, E, inner_steps=0, **knobs))
+
+    return call
+
+
+@pytest.mark.parametrize("far_px", [0, 3])
+def test_a_sky_has_none_and_that_makes_no_result_less_trusted(run, far_px):
+    """A sky that shifts by nothing between the views, or by what can be measured, above two walls."""
+    pair = pair_of_shifts(far_px, 8, 14)
+    reach_m = 120 * BASELINE_M / 0.3
+    out = run(*pair)
     at_reach = out.prediction[0, ..., 0] > 0.999 * reach_m
-    assert np.isfinite(out.prediction).all() and not at_reach[44:].any()
-    assert at_reach[:36].mean() > 0.9 if shift == 0 else not at_reach.any()
+    assert np.isfinite(out.prediction).all() and not at_reach[36:].any()
+    assert at_reach[:28].mean() > 0.9 if far_px == 0 else not at_reach.any()
     np.testing.assert_array_equal(out.confidence[0, ..., 0] == 0, at_reach)
     (verdict,) = out.verdicts
     assert verdict.trusted, verdict.reasons
     higher = verdict.indicators.confidence - out.confidence.mean()
-    assert higher > 0.1 if shift == 0 else higher == pytest.approx(0, abs=1e-6)
-    given = run(depth_range=(0.5, 10 * reach_m))
+    assert higher > 0.1 if far_px == 0 else higher == pytest.approx(0, abs=1e-6)
+    given = run(*pair, depth_range=(0.5, 10 * reach_m))
     assert (given.confidence > 0).all(), "the user says that things are further away"
+
+
+def test_a_centre_that_is_not_as_assumed_is_told_in_pixels_and_lowers_confidence(run):
+    """The right cx is larger by 6 px: of the shifts -3, 5 and 11 px the first lie behind infinity."""
+    left, right, shifts = pair_of_shifts(-3, 5, 11)
+    K_right = CAMERA.copy()
+    K_right[0, 2] += 6
+    own = run(left, right, shifts, K=(CAMERA, K_right))
+    assert own.verdicts[0].trusted and own.verdicts[0].indicators.behind_px == 0
+    for K, code in ((CAMERA, "camera.other-centre"), ((CAMERA, CAMERA), "views.behind-infinity")):
+        out = run(left, right, shifts, K=K)
+        (verdict,) = out.verdicts
+        (reason,) = [each for each in verdict.reasons if each.code in (code, "views.behind-infinity")]
+        assert reason.code == code and verdict.indicators.behind_px == pytest.approx(3, abs=0.5)
+        assert ("by 3 px or more. Give its K or cx (K_right, or --cx-right)" in reason) is (K is CAMERA)
+        assert out.confidence[0, 68:].mean() < 0.4 < 0.8 < own.confidence[0, 68:].mean()

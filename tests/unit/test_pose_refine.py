@@ -199,16 +199,29 @@ RIG = pose((0, 0, 0), (0.3, 0, 0))
 def test_what_lies_behind_infinity_is_counted_on_its_own_side_alone() -> None:
     """Depths are uniform in 2 to 8 m: disparities of 18.75 px and more."""
     tracks, Ts, depth_m = make_tracks([RIG], outliers=0.0)
-    assert behind_infinity(tracks, Ts) == 0.0
+    assert behind_infinity(tracks, Ts) == (0.0, 0.0)
     for moved, share in ((-30.0, float((150.0 / depth_m < 29.0).mean())), (30.0, 0.0), (-17.0, 0.0)):
         K_off = K.copy()
         K_off[0, 2] += moved  # a cx too small by d takes d from every disparity
         off = replace(tracks, K_rights=K_off[None])
-        assert behind_infinity(off, Ts) == pytest.approx(share, abs=0.01)
+        found = behind_infinity(off, Ts)
+        assert found.share == pytest.approx(share, abs=0.01)
+        # The farthest lies 8 m away, at a disparity of 18.75 px.
+        assert found.px == pytest.approx(max(0.0, -moved - 18.75), abs=0.6)
     up = tracks.right_px + [0.0, 3.0]  # off its lines a match says nothing
-    assert np.isnan(behind_infinity(replace(tracks, right_px=up), Ts))
-    assert np.isnan(behind_infinity(tracks.kept(slice(39)), Ts))
-    assert behind_infinity(tracks.kept(slice(40)), Ts) == 0.0
+    assert np.isnan(behind_infinity(replace(tracks, right_px=up), Ts)).all()
+    assert np.isnan(behind_infinity(tracks.kept(slice(39)), Ts)).all()
+    assert behind_infinity(tracks.kept(slice(40)), Ts) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("count", "px"), [(8, 0.0), (20, 5.0)])
+def test_single_matches_behind_infinity_say_nothing_of_how_far_it_goes(count: int, px: float) -> None:
+    """Of 600 matches 8 are 1.3 %, as of right pairs; 20 are 3.3 %."""
+    tracks, Ts, depth_m = make_tracks([RIG], noise_px=0.0, outliers=0.0)
+    right_px = tracks.right_px.copy()
+    right_px[0, :count, 0] += 150.0 / depth_m[:count] + 5.0
+    found = behind_infinity(replace(tracks, right_px=right_px), Ts)
+    assert found.share == pytest.approx(count / 600) and found.px == pytest.approx(px, abs=1e-6)
 
 
 def test_a_principal_point_that_is_off_is_seen_in_pictures_of_far_things() -> None:

@@ -145,6 +145,8 @@ def test_a_doubted_unit_is_not_trusted_unless_the_range_is_stated(signs, code):
     [
         ({"behind_infinity": 0.049}, None),
         ({"behind_infinity": 0.051}, "views.behind-infinity"),
+        ({"behind_infinity": 0.049, "centre_assumed": True}, None),
+        ({"behind_infinity": 0.051, "centre_assumed": True}, "camera.other-centre"),
         ({"behind_infinity": math.nan}, None),
         ({"distortion": 0.149}, None),
         ({"distortion": 0.151}, "views.distorted"),

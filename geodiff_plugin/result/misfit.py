@@ -1,0 +1,105 @@
+"""Errors that the matches of a run show: the standard error of its depth, and what they take from confidence.
+
+A matched depth has the error of its match, by the geometry of the cameras. Where matches also miss cameras
+that are given, by more than in any right pair, as much error is expected in the shifts between the views.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from geodiff_plugin._strips import row_strips
+from geodiff_plugin.geometry import image_size
+from geodiff_plugin.result.confidence import RIGHT_WITHIN
+from geodiff_plugin.result.indicators import pixels_of_matches
+from geodiff_plugin.types import CameraView, Indicators
+
+#: Standard deviation of a good match, pixels of the left image.
+MATCH_NOISE_PX = 0.25
+#: Residual of the matches across their epipolar lines that right pairs have, pixels of their grid: as much
+#: error as there is beyond it is expected along the lines, where it changes depth.
+USUAL_PX = 0.45
+#: Radial coefficient k1 that right pairs seem to have.
+USUAL_DISTORTION = 0.08
+
+
+class Misfit(NamedTuple):
+    """Errors that the matches of a run show, and those of right pairs do not."""
+
+    px: float = 0.0  # standard deviation of the shift between the views, pixels of the left image
+    distortion: float = 0.0  # size of the radial coefficient k1 that both pictures still have
+
+
+NO_MISFIT = Misfit()
+
+
+def misfit_of(found: Indicators, size: tuple[int, int]) -> Misfit:
+    """The misfit of a run on a left image of ``size`` ``(H, W)``, by its indicators; 0 where unknown."""
+    across, behind, bent = (
+        0.0 if math.isnan(value) else abs(value)
+        for value in (found.epipolar_px, found.behind_px, found.distortion)
+    )
+    beyond_usual = math.sqrt(max(0.0, across**2 - USUAL_PX**2)) * pixels_of_matches(size)
+    return Misfit(math.hypot(beyond_usual, behind), max(0.0, bent - USUAL_DISTORTION))
+
+
+def expected_error(
+    depth_m: np.ndarray,
+    K_left: np.ndarray,
+    poses: Sequence[np.ndarray],
+    scale_spread: float = 0.0,
+    misfit: Misfit = NO_MISFIT,
+) -> np.ndarray:
+    """Standard error of a matched depth by geometry alone, ``(H, W)`` metres: ``z^2 sigma_d / (f b)``.
+
+    For a general pose ``(z - t_z)^2 sigma_d / |f (t_xy - r_xy t_z)|``, with the pixel's ray ``r`` and the
+    right camera's centre ``t``; the least over ``poses (4, 4)``. Rotations do not change it. ``sigma_d`` is
+    the noise of a match and the ``misfit`` in pixels. A relative error ``scale_spread`` of the poses' length
+    adds to it, and the share ``k1 (|r_xy|^2 + 2 r_b^2)`` by which a distortion of both pictures changes the
+    shift between the views, with ``r_b`` the part of ``r_xy`` along the epipolar line.
+    """
+    height, width = depth_m.shape
+    error_m = np.empty((height, width))
+    noise_px = math.hypot(MATCH_NOISE_PX, misfit.px)
+    ray_x = (np.arange(width) - K_left[0, 2]) / K_left[0, 0]
+    for rows in row_strips(height, width):
+        ray_y = (np.arange(rows.start, rows.stop)[:, None] - K_left[1, 2]) / K_left[1, 1]
+        z_m = depth_m[rows]
+        best = np.full((rows.stop - rows.start, width), np.inf)
+        for E in poses:
+            moved_x, moved_y = E[0, 3] - ray_x * E[2, 3], E[1, 3] - ray_y * E[2, 3]
+            px_m = np.hypot(K_left[0, 0] * moved_x, K_left[1, 1] * moved_y)
+            with np.errstate(divide="ignore"):
+                error = (z_m - E[2, 3]) ** 2 * noise_px / px_m
+            if misfit.distortion:
+                along = (ray_x * moved_x + ray_y * moved_y) ** 2 / (moved_x**2 + moved_y**2 + 1e-12)
+                error = np.hypot(error, misfit.distortion * (ray_x**2 + ray_y**2 + 2.0 * along) * z_m)
+            best = np.minimum(best, error)
+        error_m[rows] = np.hypot(best, scale_spread * z_m)
+    return error_m
+
+
+def share_left(
+    depth_m: Tensor, K_left: Tensor, views: Sequence[CameraView], misfit: Misfit
+) -> Tensor | float:
+    """What a misfit leaves of the confidence of a depth ``(1, 1, H, W)``, in [0, 1]; 1 without one.
+
+    With a normal error of relative size ``s`` the probability of an error below ``RIGHT_WITHIN`` is
+    ``erf(RIGHT_WITHIN / (sqrt(2) s))``: this is its value with the misfit over that without it.
+    """
+    if misfit == NO_MISFIT or not views:
+        return 1.0
+    z_m, K = depth_m[0, 0].numpy(force=True), K_left.double().numpy(force=True)
+    poses = [np.linalg.inv(view.T_right_from_left.double().numpy(force=True)) for view in views]
+    without, with_it = (
+        torch.from_numpy(z_m / expected_error(z_m, K, poses, misfit=each)) for each in (NO_MISFIT, misfit)
+    )
+    within = RIGHT_WITHIN / math.sqrt(2.0)
+    share = torch.erf(within * with_it) / torch.erf(within * without)
+    return share.view(1, 1, *image_size(depth_m)).to(depth_m)
