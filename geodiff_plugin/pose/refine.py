@@ -52,8 +52,8 @@ _MOST_SHIFT = 0.8
 LENGTH_SPREAD = 0.15
 #: The same of the scene's median depth, measured on the same pairs.
 DEPTH_SPREAD = 0.05
-# A pose is not determined if the one that fits best changes log depth by more than this, in the median. It did
-# by up to .135 for right pairs, and by .17 to .64 where the yaw of E was off by a degree.
+# A pose is undetermined if the one that fits best changes log depth by more than this in the median. That was
+# up to .135 for right pairs, and .17 to .64 where the yaw of E was off by a degree.
 _MOST_SPREAD = 0.15
 # Straightening: residual above which a match counts for less, pixels.
 _BENT_PX = 0.5

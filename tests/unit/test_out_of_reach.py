@@ -82,7 +82,7 @@ BASELINE_M = 0.1
 
 
 def pair_of_shifts(*shifts_px: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Left and right picture of walls one above the other, and the pixels that each row shifts between them."""
+    """Left and right picture of walls one above the other, and the pixels by which each row shifts."""
     noise = np.random.default_rng(0).random((96, 168, 3), np.float32)
     scene = cv2.GaussianBlur(noise, (0, 0), 1.0)
     scene = (scene - scene.min()) / np.ptp(scene)
