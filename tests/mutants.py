@@ -379,7 +379,7 @@ MUTANTS = [
         "pose/tracks.py",
         ("K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5", "K[:2, 2] = K[:2, 2] * scale"),
         ("views[0][1][0, 0] / K_right[0, 0]", "K_right[0, 0] / views[0][1][0, 0]"),
-        ("(inverse_depth < 0) & (np", "(inverse_depth > 0) & (np"),
+        ("(inverse_depth < 0) & (away", "(inverse_depth > 0) & (away"),
         tests=(*CAPTURES, f"{UNIT}pose_refine.py"),
     ),
     *of(
