@@ -26,7 +26,7 @@ from geodiff_plugin.result.confidence import depth_confidence, determined, repro
 from geodiff_plugin.result.ensemble import ensemble_metric, median, spread_around
 from geodiff_plugin.result.flattening import flatten
 from geodiff_plugin.result.indicators import indicators_of, measure_indicators, read_numbers
-from geodiff_plugin.result.misfit import misfit_of, share_left
+from geodiff_plugin.result.misfit import NO_MISFIT, misfit_of, share_left
 from geodiff_plugin.result.verdict import judge, points_agreement
 from geodiff_plugin.result.voting import vote_depth
 from geodiff_plugin.scale.points import order_agreement
@@ -144,9 +144,9 @@ def _share_kept(
     evidence: Evidence, depth_m: Tensor, K: Tensor, found: Indicators, config: GuidanceConfig
 ) -> Tensor:
     """Share ``(1, 1, H, W)`` of a confidence that stays by what its whole run shows; 0 where no depth is."""
-    misfit = misfit_of(found, evidence.native.size)
-    share = points_agreement(found) * share_left(depth_m, K, evidence.native.views, misfit)
-    return share * (depth_m < _farthest_m(evidence, config))
+    native, misfit = evidence.native, misfit_of(found, evidence.native.size)
+    share = points_agreement(found) * (depth_m < _farthest_m(evidence, config))
+    return share if misfit == NO_MISFIT else share * share_left(depth_m, K, native.views, misfit)
 
 
 def _unseen(depth_m: Tensor) -> tuple[Tensor, Tensor]:

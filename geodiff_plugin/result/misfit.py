@@ -85,16 +85,12 @@ def expected_error(
     return error_m
 
 
-def share_left(
-    depth_m: Tensor, K_left: Tensor, views: Sequence[CameraView], misfit: Misfit
-) -> Tensor | float:
-    """What a misfit leaves of the confidence of a depth ``(1, 1, H, W)``, in [0, 1]; 1 without one.
+def share_left(depth_m: Tensor, K_left: Tensor, views: Sequence[CameraView], misfit: Misfit) -> Tensor:
+    """What a misfit leaves of the confidence of a depth ``(1, 1, H, W)``, shaped alike, in [0, 1].
 
     With a normal error of relative size ``s`` the probability of an error below ``RIGHT_WITHIN`` is
     ``erf(RIGHT_WITHIN / (sqrt(2) s))``: this is its value with the misfit over that without it.
     """
-    if misfit == NO_MISFIT or not views:
-        return 1.0
     z_m, K = depth_m[0, 0].numpy(force=True), K_left.double().numpy(force=True)
     poses = [np.linalg.inv(view.T_right_from_left.double().numpy(force=True)) for view in views]
     without, with_it = (
