@@ -213,7 +213,7 @@ def _variance(noise: Tensor, error: Tensor, config: GuidanceConfig) -> Tensor:
 
 def _robust(residual: Tensor, variance: Tensor) -> Tensor:
     """Cauchy weight of residuals."""
-    return 1.0 / (1.0 + residual**2 / variance)
+    return (1.0 + residual**2 / variance).reciprocal()
 
 
 def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: GuidanceConfig) -> Tensor:

@@ -11,6 +11,8 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 import triton
@@ -301,41 +303,76 @@ def _strides(shape: tuple[int, ...]) -> list[int]:
     return [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
 
 
-def _coarser(system: FieldSystem) -> FieldSystem:
-    """``FieldSystem.coarser`` of tensors that are contiguous."""
+class _Grid(NamedTuple):
+    """One grid of the pyramid: its system, and what the steps on it write."""
+
+    system: FieldSystem
+    x: Tensor  # (B, C, H, W) the field
+    work: Tensor
+    partial: Tensor  # sums of every tile
+
+
+def _is_alone(n: int) -> bool:
+    """Whether a field of so many pixels is one tile, whose program meets no other."""
+    return n <= SINGLE_TILE
+
+
+def _tiles(shape: Sequence[int]) -> int:
+    """Tiles of all fields ``(B, C, H, W)``."""
+    n = shape[2] * shape[3]
+    return triton.cdiv(n, SINGLE_TILE if _is_alone(n) else TILE) * shape[0] * shape[1]
+
+
+def _grids(finest: FieldSystem, coarser: bool) -> list[_Grid]:
+    """The pyramid from the finest grid on, in one allocation; that grid alone if not ``coarser``."""
+    batch, channels, height, width = finest.pull.shape
+    sizes = [(height, width)]
+    while coarser and min(sizes[-1]) > solver.COARSEST_SIDE:
+        sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
+    shapes = list[tuple[int, ...]]()
+    for h, w in sizes:
+        fields = (batch, channels, h, w)
+        shapes += [fields, (WORK_ARRAYS * math.prod(fields),), (SUMS * _tiles(fields),)]
+    for h, w in sizes[1:]:
+        shapes += [(batch, 1, h, w), (batch, channels, h, w), (batch, 1, h, w - 1), (batch, 1, h - 1, w)]
+    tensors = iter(_empty(finest.pull, *shapes))
+    written = [tuple(itertools.islice(tensors, 3)) for _ in sizes]
+    systems = [finest, *(FieldSystem(*itertools.islice(tensors, 4)) for _ in sizes[1:])]
+    for fine, coarse in itertools.pairwise(systems):
+        _coarsen(fine, coarse)
+    return [_Grid(system, *tensors) for system, tensors in zip(systems, written, strict=True)]
+
+
+def _coarsen(system: FieldSystem, coarse: FieldSystem) -> None:
+    """Write ``FieldSystem.coarser`` of tensors that are contiguous."""
     batch, channels, height, width = system.pull.shape
-    h, w = -(-height // 2), -(-width // 2)
-    shapes = (1, h, w), (channels, h, w), (1, h, w - 1), (1, h - 1, w)
-    coarse = FieldSystem(*_empty(system.pull, *((batch, *shape) for shape in shapes)))
+    h, w = coarse.pull.shape[-2:]
     launched_on(system.pull, coarsen_kernel[(triton.cdiv(h * w, TILE), batch * channels)])(
         *vars(system).values(), *vars(coarse).values(), height, width, h, w, channels, TILE=TILE
     )
-    return coarse
 
 
-def _conjugate_gradients(system: FieldSystem, start: Tensor | None, steps: int, arrivals: Tensor) -> Tensor:
+def _conjugate_gradients(grid: _Grid, start: Tensor | None, steps: int, arrivals: Tensor) -> Tensor:
     """The field after all steps; ``start`` is of this grid, or of the next coarser one."""
+    system = grid.system
     batch, channels, height, width = system.pull.shape
-    fields, n = batch * channels, height * width
     if start is None:
         origin, start = FROM_ZEROS, system.pull
     else:
         origin = FROM_FIELD if start.shape[-2:] == system.pull.shape[-2:] else FROM_COARSER
-    alone = n <= SINGLE_TILE
+    fields, alone = batch * channels, _is_alone(height * width)
     tile, warps = (SINGLE_TILE, SINGLE_WARPS) if alone else (TILE, WARPS)
-    count = triton.cdiv(n, tile) * fields
-    programs = fields if alone else min(count, _most_programs(start.device))
-    x, work, partial = _empty(start, system.pull.shape, (WORK_ARRAYS * fields * n,), (SUMS * count,))
+    programs = fields if alone else min(_tiles(system.pull.shape), _most_programs(start.device))
     options = {"num_warps": warps}
     if start.is_cuda:  # the interpreter knows neither
         options |= {"maxnreg": SINGLE_REGISTERS if alone else MOST_REGISTERS}
         options |= {} if alone else {"launch_cooperative_grid": True}
     launched_on(start, conjugate_gradients_kernel[(programs,)])(
-        *vars(system).values(), start, x, work, partial, arrivals,
+        *vars(system).values(), start, grid.x, grid.work, grid.partial, arrivals,
         height, width, *start.shape[-2:], channels, fields, steps, origin,
         TILE=tile, ALONE=alone, **options,
     )  # fmt: skip
-    return x
+    return grid.x
 
 
 def _of_batch(part: Tensor, pull: Tensor) -> Tensor:
@@ -345,12 +382,11 @@ def _of_batch(part: Tensor, pull: Tensor) -> Tensor:
 
 def solve_field(system: FieldSystem, steps: int, start: Tensor | None) -> Tensor:
     """``solver.solve_field`` by kernels: the same steps on the same grids."""
-    levels = [FieldSystem(*(_of_batch(part, system.pull) for part in vars(system).values()))]
-    while start is None and min(levels[-1].weight.shape[-2:]) > solver.COARSEST_SIDE:
-        levels.append(_coarser(levels[-1]))
-    arrivals = torch.zeros(len(levels), ALIGNED, dtype=torch.int32, device=system.pull.device)
+    finest = FieldSystem(*(_of_batch(part, system.pull) for part in vars(system).values()))
+    grids = _grids(finest, coarser=start is None)
+    arrivals = torch.zeros(len(grids), ALIGNED, dtype=torch.int32, device=system.pull.device)
     field = None if start is None else start.contiguous()
-    for level, counter in zip(reversed(levels), arrivals, strict=True):
-        field = _conjugate_gradients(level, field, solver.COARSEST_STEPS if field is None else steps, counter)
+    for grid, counter in zip(reversed(grids), arrivals, strict=True):
+        field = _conjugate_gradients(grid, field, solver.COARSEST_STEPS if field is None else steps, counter)
     assert field is not None  # there is one level at least
     return field

@@ -190,7 +190,7 @@ def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
     radius = max(1, round(REGION * max(depth_m.shape[-2:])))
     region = _window_sum(behind * weight, radius) / _window_sum(weight, radius).clamp_min(1.0)
     rejected = ((torch.minimum(region, behind) / least - 1.0) / (MULTIPLE - 1.0)).clamp(0.0, 1.0)
-    return 1.0 - rejected
+    return (1.0 - rejected).contiguous()  # the sums lie column by column, which everything after would copy
 
 
 def _window_sum(x: Tensor, radius: int) -> Tensor:

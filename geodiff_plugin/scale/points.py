@@ -73,7 +73,7 @@ class FitTarget(NamedTuple):
 def depth_span(points: Matches) -> tuple[Tensor, Tensor]:
     """Metres, ``()`` each, of the nearest and the farthest point."""
     inverse_depth = points.inverse_depth.flatten()[points.above(0.0)]
-    return 1.0 / inverse_depth.amax(), 1.0 / inverse_depth.amin()
+    return inverse_depth.amax().reciprocal(), inverse_depth.amin().reciprocal()
 
 
 def reliable_matches(matches: Matches) -> Matches | None:
@@ -109,7 +109,7 @@ def fit_to_points(
         if current is not None:
             near, far = torch.cat([current[0][b : b + 1], near]), torch.cat([current[1][b : b + 1], far])
         depth_m = metric(row.expand(len(near), 1, 1, -1), metric.from_range(near, far))[:, 0, 0]
-        e = (1.0 / depth_m - target) / (BASIN_CAUCHY * points.plane_step)
+        e = (depth_m.reciprocal() - target) / (BASIN_CAUCHY * points.plane_step)
         cost = torch.log1p(e * e).mean(1)
         best = cost.argmin(keepdim=True)  # a 0-d index would be read back from the device
         if current is not None:

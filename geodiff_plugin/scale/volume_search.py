@@ -71,7 +71,7 @@ def look_up(groups: Groups, inverse_depth: Tensor, depth_m: Tensor) -> tuple[Ten
     """
     planes = inverse_depth.shape[0]
     step = (inverse_depth[-1] - inverse_depth[0]) / (planes - 1)
-    position = (1.0 / depth_m - inverse_depth[0]) / step
+    position = (depth_m.reciprocal() - inverse_depth[0]) / step
     inside = (position >= 0) & (position <= planes - 1)
     # NaN cannot be an index; ``algorithm.gradients.FiniteWatch`` reports its origin after the loop.
     position = position.clamp(0, planes - 1).nan_to_num(0.0)
