@@ -24,6 +24,10 @@ class InputTypeError(InputError, TypeError):
     """An input of the wrong type."""
 
 
+class UnknownFormatError(InputError):
+    """A file in none of the formats that can be read."""
+
+
 class InputFileError(InputError, OSError):
     """A file or folder that cannot be read or written."""
 

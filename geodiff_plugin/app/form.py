@@ -11,14 +11,17 @@ from typing import Any
 import gradio as gr
 
 from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin.app import look
 from geodiff_plugin.app.job import CAMERA_WAYS, LIMITS, CameraFields, Priors, options_of, photograph_size
-from geodiff_plugin.app.look import for_visitors
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER, REAL_PAIRS_FOLDER
+from geodiff_plugin.formats.reading import CALIBRATION_FORMATS
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.options import PRESETS, help_of
 
 PICTURE_HEIGHT = 130
-EXAMPLES_HEIGHT = 120
+CALIBRATION_HEIGHT = 104
+#: Short, as it stands in a field of half a phone's width.
+DROP_HERE = "Drop or choose"
 #: Of handlers that only the page itself calls.
 QUICK: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
 #: Of taps that come at once every one counts, after the one before.
@@ -57,8 +60,8 @@ EXAMPLES = (
     Example(REAL_PAIRS_FOLDER / "toy", "png", "Playroom"),
     Example(REAL_PAIRS_FOLDER / "cycles", "png", "Hallway"),
     Example(REAL_PAIRS_FOLDER / "donkey_toy", "png", "Bedroom"),
-    Example(DEMO_PAIR_FOLDER, "png", "Desk, rendered"),
-    Example(PAIRS_FOLDER / "street", "jpg", "Street, rendered"),
+    Example(DEMO_PAIR_FOLDER, "png", "Desk"),
+    Example(PAIRS_FOLDER / "street", "jpg", "Street"),
 )
 
 
@@ -115,7 +118,12 @@ def _path_of(payload: Any) -> str | None:
 def photograph_field(label: str, name: str) -> gr.Image:
     """A field for one photograph, whose value is the path of the file that was dropped, unchanged."""
     image = gr.Image(
-        label=label, type="filepath", sources=["upload", "clipboard"], height=PICTURE_HEIGHT, elem_id=name
+        label=label,
+        type="filepath",
+        sources=["upload", "clipboard"],
+        height=PICTURE_HEIGHT,
+        placeholder=DROP_HERE,
+        elem_id=name,
     )
     # gradio's own opens the file, and says what is wrong with it in words of Pillow.
     vars(image)["preprocess"] = _path_of
@@ -129,7 +137,7 @@ def _told(path: str | None, name: str) -> str:
     try:
         width, height = photograph_size(path, name)
     except InputError as error:
-        return f'<div class="note bad" role="alert">{escape(for_visitors(str(error)))}</div>'
+        return f'<div class="note bad" role="alert">{escape(look.for_visitors(str(error)))}</div>'
     shows = "" if Path(path).suffix.lower() not in (".heic", ".heif") else "; browsers cannot show HEIC"
     return f'<div class="note">{width} x {height} pixels{shows}</div>'
 
@@ -149,9 +157,10 @@ def _views() -> dict[str, Any]:
     drawn["calib"] = calibration = gr.File(
         label="Calibration file, or one per camera",
         file_count="multiple",
-        height=112,
+        height=CALIBRATION_HEIGHT,
         elem_id="calibration",
     )
+    readable = gr.HTML(look.formats(entry.summary for entry in CALIBRATION_FORMATS.values()))
     with gr.Column(visible=False) as lens, gr.Row():
         for name, placeholder in (("fx", "focal"), ("fy", "as fx"), ("cx", "middle"), ("cy", "middle")):
             drawn[name] = _optional(name, placeholder)
@@ -163,10 +172,11 @@ def _views() -> dict[str, Any]:
         drawn |= _length_fields(drawn["left"])
 
     def show(chosen: str) -> list[Any]:
-        shown = chosen == "file", chosen != "file", chosen == "numbers", chosen == "photographs"
+        by_file = chosen == "file"
+        shown = by_file, by_file, not by_file, chosen == "numbers", chosen == "photographs"
         return [gr.update(visible=seen) for seen in shown]
 
-    way.change(show, way, [calibration, lens, cx_right, length], **QUICK)
+    way.change(show, way, [calibration, readable, lens, cx_right, length], **QUICK)
     return drawn
 
 
@@ -213,13 +223,13 @@ def _settings(priors: Priors) -> dict[str, Any]:
 
 def build_examples() -> gr.Gallery:
     """Draw the examples into the open gradio context."""
+    gr.HTML(f'<div class="legend-caption" id="examples-note">{look.EXAMPLES_NOTE}</div>')
     return gr.Gallery(
         [(str(example.left), example.label) for example in EXAMPLES],
         label="Examples: one click runs one",
         show_label=False,
         columns=len(EXAMPLES),
         rows=1,
-        height=EXAMPLES_HEIGHT,
         allow_preview=False,
         interactive=False,
         buttons=[],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
@@ -15,8 +15,8 @@ from geodiff_plugin.result.standing import Tone, cure_of
 HEADER = """
 <div class="head">
   <h1>Depth in metres from two photographs</h1>
-  <p>A diffusion model gives the shape, a second photograph from a known place the metres.
-  Your pictures and results are deleted after ten minutes, or ten seconds after you close this tab.</p>
+  <p>A diffusion model gives the shape, a second photograph the metres. Your pictures and results are
+  deleted after ten minutes, or ten seconds after you close this tab.</p>
 </div>
 """
 BUSY = '<div class="say say-busy"></div>'
@@ -29,6 +29,7 @@ HOW_TO_MEASURE = (
 CLICK_TWO = "Click two points to measure between them."
 CLICK_OR_BRING = "Click two points, or bring your own pair."
 SECOND_POINT = "Click a second point for the distance."
+EXAMPLES_NOTE = "One click runs an example. Desk and street are rendered."
 NO_FILES = (
     '<div class="say say-quiet">This result was made beforehand. Run the example, or your own pair, and its '
     "files are here: depth as PNG and NumPy, point cloud, mesh, report.</div>"
@@ -72,7 +73,10 @@ VIEWER = """
     <button name="reset" type="button">Reset view</button>
     <span class="viewer-count"></span>
   </div>
-  <div class="viewer-hint legend-caption">Drag to turn; click into it, then scroll to come nearer.</div>
+  <div class="viewer-hint legend-caption">
+    <span class="with-mouse">Drag to turn; click into it, then scroll to come nearer.</span>
+    <span class="with-finger">Drag sideways to turn, pinch to come nearer, tap to measure.</span>
+  </div>
 </div>
 """
 
@@ -118,7 +122,7 @@ def hidden(data: str) -> str:
 CSS = """
 .gradio-container { max-width: 1500px !important; margin: 0 auto !important; }
 .head h1 { font-size: 1.65rem; font-weight: 700; margin: 0.2rem 0; }
-.head p { color: var(--body-text-color-subdued); margin: 0; max-width: 70rem; }
+.head p { color: var(--body-text-color-subdued); margin: 0; max-width: 80rem; }
 .say, .verdict { border-radius: 8px; padding: 0.7rem 1rem; line-height: 1.45;
   border: 1px solid var(--border-color-primary); background: var(--background-fill-secondary); }
 .say-busy { min-height: 4.6rem; }
@@ -134,7 +138,17 @@ CSS = """
   background: #a16207; color: white; font-weight: 600; }
 #results.stale::before { display: block; }
 #results.stale > * { opacity: 0.45; }
-#examples .caption-label { font-size: 0.66rem; max-width: none; padding: 0.1rem 0.3rem; }
+#examples { height: auto !important; }
+#examples .grid-wrap { height: auto !important; max-height: none; min-height: 0; overflow: visible;
+  padding: 0.4rem; }
+#examples .grid-container { gap: 0.4rem; grid-template-columns: repeat(5, minmax(0, 1fr));
+  grid-template-rows: auto; height: auto; }
+#examples .gallery-item, #examples .thumbnail-lg { aspect-ratio: 4 / 3; height: auto; width: 100%; }
+#examples .caption-label { font-size: clamp(0.55rem, 1.8vw, 0.7rem); left: auto; max-width: none;
+  padding: 0 0.25rem; }
+#examples-note { text-align: left; }
+#calibration .icon-wrap { display: none; }
+#calibration .upload-container { padding-top: 1.4rem; line-height: 1.25; }
 .tab-container button.selected { color: #0f766e !important; }
 .dark .tab-container button.selected { color: #5eead4 !important; }
 .figures { display: flex; flex-wrap: wrap; gap: 0.4rem 2rem; margin-top: 0.3rem; }
@@ -153,7 +167,7 @@ CSS = """
 .distance { font-size: 1.55rem; font-weight: 700; white-space: nowrap; font-variant-numeric: tabular-nums;
   margin: 0.1rem 0 0.4rem; }
 #measure-picture img, .viewer canvas { cursor: crosshair; }
-.picture { max-width: 100%; max-height: 60vh; border-radius: 6px; }
+.picture { display: block; margin: 0 auto; max-width: 100%; max-height: 60vh; border-radius: 6px; }
 .headline { padding: 0.1rem 0 0.4rem; }
 .headline .hint { color: var(--body-text-color-subdued); }
 .viewer-stage { position: relative; height: min(50vh, 560px); border-radius: 8px; overflow: hidden; }
@@ -204,16 +218,35 @@ CSS = """
 #scene-data, #marks-data { display: none; }
 :focus-visible { outline: 3px solid #0d9488 !important; outline-offset: 2px; }
 footer { opacity: 0.8; }
+.with-finger { display: none; }
+@media (pointer: coarse) { .with-finger { display: inline; } .with-mouse { display: none; } }
 @media (max-width: 900px) {
   #main { grid-template-columns: minmax(0, 1fr); grid-template-rows: none;
     grid-template-areas: "examples" "results" "form"; }
-  .gradio-container main { padding: 0.6rem !important; }
   .head h1 { font-size: 1.3rem; }
   .viewer-stage { height: 44vh; }
-  .figures { gap: 0.1rem 1rem; }
+  .figures { gap: 0.1rem 1rem; margin-top: 0; }
   .figures b { font-size: 0.95rem; }
   .figures span { font-size: 0.72rem; }
   .viewer-bar input[type=range] { width: 5.5rem; }
+}
+@media (max-width: 500px) {
+  .html-container:has(.head) { padding: 0 !important; }
+  #main, .head { margin-inline: -1.3rem; width: auto !important; }  /* gradio's margins are wide */
+  .head h1 { font-size: 1.08rem; margin: 0; }
+  #examples-note { font-size: 0.72rem; }
+  .head p, .say, .verdict { font-size: 0.8rem; }
+  .head p { line-height: 1.35; }
+  .say, .verdict { padding: 0.4rem 0.7rem; line-height: 1.35; }
+  .verdict b:first-child { font-size: 1rem; }
+  .figures { display: grid; gap: 0 0.5rem; grid-template-columns: repeat(3, auto); }
+  .figures b { font-size: 0.82rem; white-space: nowrap; }
+  .figures span { font-size: 0.66rem; }
+  .tab-container button { font-size: 0.82rem; padding: 0 0.45rem !important; }
+  .headline { font-size: 0.85rem; min-height: 3.6rem; padding: 0 0 0.2rem; }  /* taps do not move the view */
+  #left label svg, #right label svg { display: none; }
+  #left label, #right label { font-size: 0.72rem; padding-inline: 0.3rem; }
+  .distance { font-size: 1.3rem; }
 }
 """.replace("STALE_TEXT", STALE)
 
@@ -225,9 +258,21 @@ def _box(kind: str, role: str, body: str) -> str:
 STOPPED = _box("say say-quiet", "status", "Stopped.")
 
 
-def failed(sentence: str) -> str:
-    """A box that says what was wrong with the input, or that there is a defect."""
-    return _box("say say-bad", "alert", f"<b>That did not work.</b> {html.escape(sentence)}")
+def failed(sentence: str, link: str = "") -> str:
+    """A box that says what was wrong with the input, or that there is a defect, with where to read more."""
+    return _box("say say-bad", "alert", f"<b>That did not work.</b> {html.escape(sentence)} {link}".rstrip())
+
+
+UNKNOWN_CALIBRATION = "The calibration file is in none of the formats that can be read here."
+#: To the list below the field, which opens when it is followed.
+LINK_TO_FORMATS = '<a href="#readable-formats">These can be read.</a>'
+
+
+def formats(summaries: Iterable[str]) -> str:
+    """The calibration files that can be read, folded up."""
+    rows = "".join(f"<li>{html.escape(summary)}</li>" for summary in summaries)
+    title = "Which calibration files can be read?"
+    return f'<details class="note"><summary>{title}</summary><ul id="readable-formats">{rows}</ul></details>'
 
 
 #: What the command line says in its own terms, and its words for a visitor of the page.

@@ -15,7 +15,7 @@ from typing import Any
 
 import gradio as gr
 
-from geodiff_plugin._checks import InputError
+from geodiff_plugin._checks import InputError, UnknownFormatError
 from geodiff_plugin.app import look, results
 from geodiff_plugin.app.form import EXAMPLES, QUICK, TAPS, Form, build_examples, build_form
 from geodiff_plugin.app.job import Priors, run_job
@@ -105,12 +105,14 @@ def _uploads(paths: list[str | None]) -> set[Path]:
     return {p.parent for p in there if not any(filecmp.cmp(p, each, shallow=False) for each in examples)}
 
 
-def _sentence(error: Exception) -> str:
-    """One for the visitor; a defect's traceback goes to the terminal."""
+def _failed(error: Exception) -> str:
+    """HTML of a sentence for the visitor; a defect's traceback goes to the terminal."""
+    if isinstance(error, UnknownFormatError):
+        return look.failed(look.UNKNOWN_CALIBRATION, look.LINK_TO_FORMATS)
     if isinstance(error, InputError):
-        return look.for_visitors(str(error))
+        return look.failed(look.for_visitors(str(error)))
     traceback.print_exception(error, file=sys.stderr)
-    return f"This is a defect, not your input: {type(error).__name__}."
+    return look.failed(f"This is a defect, not your input: {type(error).__name__}.")
 
 
 def _measured(shown: Shown, pixels: Pixels) -> dict[str, str]:
@@ -153,8 +155,9 @@ def _nothing(status: str) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class _Desk:
-    """What a run needs beside its fields; one for all visitors."""
+    """What runs and measurements need beside their fields; one for all visitors."""
 
+    first: First
     form: Form
     panels: Panels
     memory: Memory
@@ -217,7 +220,7 @@ class _Desk:
         except Stopped:
             return self.show_nothing(look.STOPPED)
         except Exception as error:  # whatever it is, the visitor reads a sentence
-            return self.show_nothing(look.failed(_sentence(error)))
+            return self.show_nothing(_failed(error))
         finally:
             session.stop = threading.Event()
 
@@ -244,6 +247,38 @@ class _Desk:
         self.sessions.keeper.end_in(secret, FORGET_AFTER_S)
         self.sessions.of(request.session_hash).secret = secret
         return self.show(secret, shown)
+
+    def shown_by(self, secret: str) -> Shown | None:
+        """The result of a tab, at first the one that was made beforehand; ``None`` when its time is over."""
+        return self.sessions.keeper.get(secret) if secret else self.first.shown
+
+    def measure(self, secret: str, pixels: Pixels) -> dict[Any, Any]:
+        """What the maps say at these pixels, on every panel that says it."""
+        shown = self.shown_by(secret)
+        if shown is None:
+            return {self.panels.readings: look.failed("This result is no longer here. Estimate again.")}
+        return {self.memory.pixels: pixels, **self.on_panels(_measured(shown, pixels))}
+
+    def add_point(self, secret: str, pixels: Pixels, typed: str) -> dict[Any, Any]:
+        """One more point, by its pixel as it was typed or clicked."""
+        numbers = [int(word) for word in re.findall(r"\d{1,13}", typed or "")]
+        if len(numbers) < 2:
+            return {self.panels.readings: "Type two whole numbers: x, y."}
+        try:
+            return self.measure(secret, [*pixels, (numbers[0], numbers[1])][-len(results.NAMES) :])
+        except InputError as error:
+            return {self.panels.readings: _failed(error)}
+
+    def clear_points(self, secret: str) -> dict[Any, Any]:
+        """No points."""
+        return self.measure(secret, [])
+
+    def open_files(self, secret: str, pixels: Pixels, event: gr.SelectData) -> Any:
+        """Files with what was measured, as soon as their tab is opened."""
+        shown = self.shown_by(secret)
+        if shown is None or event.value != FILES_TAB:
+            return gr.skip()
+        return look.files(results.files_of(shown, pixels))
 
     def leave(self, request: gr.Request) -> None:
         """End what a closed tab had."""
@@ -280,42 +315,16 @@ def _wire_form(desk: _Desk) -> None:
     gr.on(changes, None, js=look.CHANGED, queue=False)
 
 
-def _wire_measuring(desk: _Desk, first: First) -> None:
+def _wire_measuring(desk: _Desk) -> None:
     """What happens when points are chosen, in the 3D view, on the photograph or by their numbers."""
-    panels, memory, keeper = desk.panels, desk.memory, desk.sessions.keeper
-
-    def shown_by(secret: str) -> Shown | None:
-        return keeper.get(secret) if secret else first.shown
-
-    def redraw(secret: str, pixels: Pixels) -> dict[Any, Any]:
-        shown = shown_by(secret)
-        if shown is None:
-            return {panels.readings: look.failed("This result is no longer here. Estimate again.")}
-        return {memory.pixels: pixels, **desk.on_panels(_measured(shown, pixels))}
-
-    def add(secret: str, pixels: Pixels, typed: str) -> dict[Any, Any]:
-        numbers = [int(word) for word in re.findall(r"\d{1,13}", typed or "")]
-        if len(numbers) < 2:
-            return {panels.readings: "Type two whole numbers: x, y."}
-        try:
-            return redraw(secret, [*pixels, (numbers[0], numbers[1])][-len(results.NAMES) :])
-        except InputError as error:
-            return {panels.readings: look.failed(_sentence(error))}
-
-    def turn(secret: str, pixels: Pixels, event: gr.SelectData) -> Any:
-        """Files with what was measured, made when their tab is opened."""
-        shown = shown_by(secret)
-        if shown is None or event.value != FILES_TAB:
-            return gr.skip()
-        return look.files(results.files_of(shown, pixels))
-
+    panels, memory = desk.panels, desk.memory
     measured = [memory.pixels, panels.marks_data, panels.headline, panels.picture, panels.readings]
     picked = [memory.secret, memory.pixels, panels.picked]
-    panels.pick.click(add, picked, measured, js=look.PICKED, **TAPS)
+    panels.pick.click(desk.add_point, picked, measured, js=look.PICKED, **TAPS)
     typed = [panels.add.click, panels.pixel.submit]
-    gr.on(typed, add, [memory.secret, memory.pixels, panels.pixel], measured, **QUICK)
-    panels.clear.click(lambda secret: redraw(secret, []), memory.secret, measured, **QUICK)
-    panels.tabs.select(turn, [memory.secret, memory.pixels], panels.files, **QUICK)
+    gr.on(typed, desk.add_point, [memory.secret, memory.pixels, panels.pixel], measured, **QUICK)
+    panels.clear.click(desk.clear_points, memory.secret, measured, **QUICK)
+    panels.tabs.select(desk.open_files, [memory.secret, memory.pixels], panels.files, **QUICK)
 
 
 def _build_panels(html: dict[str, str]) -> Panels:
@@ -369,10 +378,10 @@ def build_page(priors: Priors) -> gr.Blocks:
                 panels = _build_panels(_drawn(first.shown, first.pixels))
             with gr.Column(elem_id="form"):
                 form = build_form(priors)
-        desk = _Desk(form, panels, memory, priors, sessions, Turns())
+        desk = _Desk(first, form, panels, memory, priors, sessions, Turns())
         _wire_run(desk, examples)
         _wire_form(desk)
-        _wire_measuring(desk, first)
+        _wire_measuring(desk)
         page.load(desk.come_back, memory.secret, desk.of_result(), js=look.COME_BACK, **QUICK)
         page.unload(desk.leave)
     return page

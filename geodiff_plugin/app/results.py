@@ -9,7 +9,7 @@ import zlib
 from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
-from io import BytesIO
+from io import BytesIO, StringIO
 from pathlib import Path
 from zipfile import ZIP_STORED, ZipFile
 
@@ -212,32 +212,49 @@ def _words(readings: list[Reading]) -> str:
     return f'<div class="say">{segments}{table}{more}<p class="legend-caption">{note}</p></div>'
 
 
-def _write_readings(path: Path, readings: Sequence[Reading]) -> None:
-    """Points and segments as CSV: pixels of the photograph, metres."""
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(("name", "x_px", "y_px", "x_m", "y_m", "z_m", "spread_m", "confidence", "distance_m"))
-        for name, each in zip(NAMES, readings, strict=False):
-            point = (f"{value:.4f}" for value in each.point_m)
-            writer.writerow((name, *each.pixel, *point, each.spread_m, each.confidence, ""))
-        for a, b, first, second in zip(NAMES[::2], NAMES[1::2], readings[::2], readings[1::2], strict=False):
-            length, spread = distance_m(first, second)
-            writer.writerow((f"{a} to {b}", *[""] * 5, spread, "", f"{length:.4f}"))
+def _readings_as_csv(readings: Sequence[Reading]) -> str:
+    """Points and segments: pixels of the photograph, metres. Empty without any."""
+    if not readings:
+        return ""
+    table = StringIO(newline="")
+    writer = csv.writer(table)
+    writer.writerow(("name", "x_px", "y_px", "x_m", "y_m", "z_m", "spread_m", "confidence", "distance_m"))
+    for name, each in zip(NAMES, readings, strict=False):
+        point = (f"{value:.4f}" for value in each.point_m)
+        writer.writerow((name, *each.pixel, *point, each.spread_m, each.confidence, ""))
+    for a, b, first, second in zip(NAMES[::2], NAMES[1::2], readings[::2], readings[1::2], strict=False):
+        length, spread = distance_m(first, second)
+        writer.writerow((f"{a} to {b}", *[""] * 5, spread, "", f"{length:.4f}"))
+    return table.getvalue()
+
+
+def _write_measurements(path: Path, readings: Sequence[Reading]) -> bool:
+    """Write what was measured, or delete it where nothing was; whether that changes what was there."""
+    now = _readings_as_csv(readings).encode()
+    if now == (path.read_bytes() if path.exists() else b""):
+        return False
+    if now:
+        path.write_bytes(now)
+    else:
+        path.unlink()
+    return True
 
 
 def files_of(shown: Shown, pixels: Sequence[tuple[int, int]] = ()) -> list[Path]:
-    """Everything that can be downloaded, first all in one, with ``measurements.csv`` of these pixels."""
+    """Everything that can be downloaded, first all in one, with ``measurements.csv`` of these pixels.
+
+    The archive of all is made anew only where something else was measured.
+    """
     folder = shown.folder
     if folder is None:
         return []
-    if pixels:
-        _write_readings(folder / MEASUREMENTS, [reading(shown, pixel) for pixel in pixels])
-    else:
-        (folder / MEASUREMENTS).unlink(missing_ok=True)
+    measured = [reading(shown, pixel) for pixel in pixels]
+    archive_is_old = _write_measurements(folder / MEASUREMENTS, measured)
     wanted = f"depth_mm.png depth.npy depth.png confidence.npy cloud.ply cloud.glb mesh.glb {REPORT}".split()
     others = sorted({path.name for path in folder.iterdir()} - {*wanted, EVERYTHING})
     paths = [folder / name for name in (*wanted, *others) if (folder / name).is_file()]
-    with ZipFile(folder / EVERYTHING, "w", ZIP_STORED) as archive:
-        for path in paths:
-            archive.write(path, path.name)
+    if archive_is_old or not (folder / EVERYTHING).exists():
+        with ZipFile(folder / EVERYTHING, "w", ZIP_STORED) as archive:
+            for path in paths:
+                archive.write(path, path.name)
     return [folder / EVERYTHING, *paths]

@@ -417,11 +417,32 @@
     if (at) send(at[0], at[1]);
   });
 
+  /* ---- names for screen readers, where gradio's own do not say of what they are ---- */
+
+  function nameAfter(root, field) {
+    root.querySelectorAll("button[aria-label]").forEach((button) => {
+      const own = button.getAttribute("aria-label");
+      if (field && !own.startsWith(field)) button.setAttribute("aria-label", `${field}: ${own}`);
+    });
+  }
+
+  function nameFields() {
+    document.querySelectorAll("svg:not([aria-hidden])").forEach((icon) => icon.setAttribute("aria-hidden", "true"));
+    document.querySelectorAll("#examples button").forEach((button) =>
+      button.setAttribute("aria-label", `Run the example ${button.textContent.trim()}`));
+    document.querySelectorAll("#left, #right, #calibration").forEach((root) =>
+      nameAfter(root, root.querySelector("label")?.textContent.trim()));
+    document.querySelectorAll("#form input[type=range]").forEach((slider) => {
+      const root = slider.closest(".block");
+      nameAfter(root, root.querySelector("[data-testid=block-info]")?.textContent.trim());
+    });
+  }
+
   let due = false;
   const soon = () => {
     if (due) return;
     due = true;
-    setTimeout(() => { due = false; scan(); }, 100);
+    setTimeout(() => { due = false; nameFields(); scan(); }, 100);
   };
   const foreign = ({ target }) => !target.closest?.(".viewer, .compare"); // what is drawn here is no news
   new MutationObserver((changes) => { if (changes.some(foreign)) soon(); })

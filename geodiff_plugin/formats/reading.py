@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_type, bad_value, check_number, warn
+from geodiff_plugin._checks import UnknownFormatError, bad_type, bad_value, check_number, warn
 from geodiff_plugin.formats import colmap, devices, robotics, stereo, storage, transforms
 from geodiff_plugin.formats.files import PathLike
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
@@ -112,7 +112,8 @@ def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
         if not fits:
             formats = "; ".join(entry.summary for entry in CALIBRATION_FORMATS.values())
             cure = "Is this the right file? Otherwise give fx, fy, cx, cy and baseline, or K and E."
-            bad_value("calibration", f"in a known format ({formats})", f"{path}, which is none of them", cure)
+            expected, got = f"in a known format ({formats})", f"{path}, which is none of them"
+            bad_value("calibration", expected, got, cure, UnknownFormatError)
         names.add(fits[0])
     if len(names) != 1:
         bad_value("calibration", "files of one format", " and ".join(sorted(names)) or "none")

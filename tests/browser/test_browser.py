@@ -12,6 +12,19 @@ import numpy as np
 import pytest
 
 RUN_MS = 600_000
+#: Roles whose elements need a name.
+SPOKEN = {"application", "button", "checkbox", "combobox", "image", "link", "listbox", "radio"}
+SPOKEN |= {"searchbox", "slider", "spinbutton", "tab", "textbox"}
+#: What has the focus, and the width of the line around it or what it is drawn in, in pixels.
+FOCUS = """() => {
+  const focused = document.activeElement;
+  const widths = [focused, focused.closest("label"), focused.parentElement].filter(Boolean).map((element) => {
+    const style = getComputedStyle(element);
+    return style.outlineStyle === "none" ? 0 : parseFloat(style.outlineWidth);
+  });
+  return [`${focused.tagName.toLowerCase()} ${focused.innerText || focused.ariaLabel || focused.name || ""}`,
+    Math.max(...widths)];
+}"""
 NUMBER = r"(\d+\.\d+)"
 
 
@@ -125,6 +138,53 @@ def test_what_is_no_picture_is_told_at_once(visitor, tmp_path):
     page.locator("#left input[type=file]").first.set_input_files(str(tmp_path / "text.png"))
     said = page.wait_for_selector("#left-note .bad").inner_text()
     assert "the left photograph must be an image file" in said and "/tmp" not in said
+
+
+def accessible(page) -> list[tuple[str, str]]:
+    """Role and name of every control and picture, as a screen reader is told them."""
+    session = page.context.new_cdp_session(page)
+    nodes = session.send("Accessibility.getFullAXTree")["nodes"]
+    told = [(n["role"]["value"], n.get("name", {}).get("value", "")) for n in nodes if not n["ignored"]]
+    return [(role, name.strip()) for role, name in told if role in SPOKEN]
+
+
+@pytest.mark.parametrize(
+    "way", ["Calibration file", "Focal length and baseline", "Estimate from the photographs"]
+)
+def test_screen_readers_hear_what_every_control_is(visitor, plane_files, way):
+    page = visitor()
+    page.get_by_role("button", name="Settings").click()
+    page.get_by_label(way).first.click()
+    page.wait_for_timeout(1000)
+    empty = accessible(page)
+    upload(page, plane_files()[: 3 if way == "Calibration file" else 2])
+    page.wait_for_timeout(1000)
+    for tab_name in ("3D", "Depth", "Measure", "Confidence", "Files"):
+        tab(page, tab_name)
+        page.wait_for_timeout(500)
+        told = [*empty, *accessible(page)]
+        assert all(name for _, name in told), f"without a name: {[role for role, name in told if not name]}"
+        buttons = [name for role, name in accessible(page) if role == "button"]
+        assert len(buttons) == len(set(buttons)), f"not told apart: {sorted(buttons)}"
+    assert ("button", "Run the example Hallway") in empty
+    assert any(role == "button" and name.startswith("Left photograph: ") for role, name in empty)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_focus_is_seen_wherever_the_keyboard_leads(visitor, scheme):
+    page = visitor()
+    page.emulate_media(color_scheme=scheme)
+    page.wait_for_selector(".viewer-count >> text=% of the pixels")
+    page.locator("body").click(position={"x": 2, "y": 2})
+    seen = []
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        name, outline = page.evaluate(FOCUS)
+        if name in seen[-1:] or name == "BODY":
+            break
+        seen.append(name)
+        assert outline >= 2, f"the focus on {name} is not seen"
+    assert any("Estimate depth" in name for name in seen) and any("canvas" in name for name in seen)
 
 
 def test_two_taps_give_the_ends_of_a_known_length(visitor, plane_files):

@@ -160,6 +160,8 @@ def test_a_job_and_its_files(result):
     assert report["inputs"]["E"][0][3] == pytest.approx(0.12) and report["arguments"]["left"] == "left.png"
     assert report["arguments"]["ensemble"] == 2 and "cx is assumed" in " ".join(report["warnings"])
     assert report["verdict"]["status"] == result.standing.status
+    paths[0].write_bytes(b"kept")
+    assert results.files_of(result)[0].read_bytes() == b"kept", "nothing else is measured, so it stays"
     pixels = [(5, 5), (50, 40), (20, 20)]
     with ZipFile(results.files_of(result, pixels)[0]) as archive:  # which does not hold itself
         assert sorted(archive.namelist()) == sorted([*names[1:], "measurements.csv"])
@@ -393,6 +395,20 @@ class TestWithGradio:
         said = "LEFT must be an image; got /tmp/x/left.png. Give --fx, or widen depth_range (--near, --far)."
         told = "the left photograph must be an image; got left.png. Give fx, or widen depth_range."
         assert for_visitors(said) == told
+
+    def test_a_calibration_of_no_known_format_is_one_short_sentence_with_a_link(self, tmp_path):
+        from geodiff_plugin.app.look import formats
+        from geodiff_plugin.app.page import _failed
+        from geodiff_plugin.formats.reading import CALIBRATION_FORMATS
+
+        (tmp_path / "notes.txt").write_text("no calibration")
+        with pytest.raises(ValueError) as refused:
+            read_calibration(tmp_path / "notes.txt")
+        said = _failed(refused.value)
+        assert len(re.sub("<[^>]*>", "", said)) < 120
+        target = re.search('href="#([^"]*)"', said)[1]
+        listed = formats(entry.summary for entry in CALIBRATION_FORMATS.values())
+        assert f'id="{target}"' in listed and "OAK-D JSON" in listed
 
     def test_the_banner_has_the_words_of_the_command_and_the_cure_of_an_assumption(self, result):
         from geodiff_plugin.app.look import banner

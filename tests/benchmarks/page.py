@@ -1,0 +1,78 @@
+"""Peak memory of the page's process while it runs one pair, by the size of its photographs.
+
+python -m tests.benchmarks.page --megapixels 4,16
+
+A real pair of the package is scaled to each size and run as a visitor's, in a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+
+MIB = 1024
+#: The fields of a run that a visitor leaves alone.
+RUN = {"prior": "bundled", "ensemble": 1, "seed": 0, "preset": "default"}
+
+
+def _run_one(megapixels: float) -> dict[str, float]:
+    """Peak resident memory, MiB, of this process: with the prior alone, and after one run."""
+    import torch
+    from PIL import Image
+
+    from geodiff_plugin import read_calibration
+    from geodiff_plugin.app import page, results
+    from geodiff_plugin.app.job import Priors, options_of, run_job
+    from geodiff_plugin.app.shown import shown_of
+    from geodiff_plugin.bundled.demo_pair import REAL_PAIRS_FOLDER
+
+    folder, source = Path(tempfile.mkdtemp()), REAL_PAIRS_FOLDER / "toy"
+    tempfile.tempdir = str(folder)
+    photographs = {side: Image.open(source / f"{side}.png").convert("RGB") for side in ("left", "right")}
+    width, height = photographs["left"].size
+    factor = (megapixels * 1e6 / (width * height)) ** 0.5
+    for side, photograph in photographs.items():
+        photograph.resize((round(factor * width), round(factor * height))).save(folder / f"{side}.png")
+    rig = read_calibration(source / "calib.txt")
+    (fx, _, cx), (_, fy, cy), _ = (row.tolist() for row in rig.K_left)
+    lens = {"fx": factor * fx, "fy": factor * fy}
+    lens |= {name: factor * (c + 0.5) - 0.5 for name, c in (("cx", cx), ("cy", cy))}
+    priors = Priors(("bundled",), torch.device("cpu"))
+    priors.get("bundled")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB
+    left, right = (str(folder / f"{side}.png") for side in photographs)
+    options = options_of(left, right, "numbers", baseline=float(rig.E[0, 3]), lens=lens, **RUN)
+    shown = shown_of(run_job(options, priors, threading.Event(), lambda share, stage: None))
+    page._drawn(shown, [], results.files_of(shown))
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB
+    return {"megapixels": shown.depth_m.size / 1e6, "prior_mib": before, "peak_mib": after}
+
+
+def main() -> None:
+    """Print a line for each size."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--megapixels", default="4,16", help="sizes, separated by commas")
+    parser.add_argument("--one", type=float, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.one is not None:
+        print(json.dumps(_run_one(args.one)))
+        return
+    for size in args.megapixels.split(","):
+        command = [sys.executable, "-m", "tests.benchmarks.page", "--one", size]
+        answer = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        measured = json.loads(answer.splitlines()[-1])
+        print(
+            f"{measured['megapixels']:5.1f} megapixels: {measured['peak_mib']:.0f} MiB, "
+            f"{measured['prior_mib']:.0f} MiB before the run",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
