@@ -37,7 +37,7 @@ CAMERA_WAYS = {
 }
 #: A coordinate of an end of the known length.
 ENDS = re.compile(r"-?\d+(?:\.\d+)?")
-#: A photograph of more is not decoded: at this size the process of the page peaks at some 4 GB, and at some
+#: A photograph of more is not decoded: at this size the process of the page peaks at 4.2 GB, and at some
 #: 200 MB more for every further megapixel (``python -m tests.benchmarks.page``).
 MOST_MEGAPIXELS = 16
 #: Folder of results below that of temporary files, the only one whose files the page hands out.

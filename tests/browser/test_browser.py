@@ -180,7 +180,7 @@ def test_the_focus_is_seen_wherever_the_keyboard_leads(visitor, scheme):
     for _ in range(60):
         page.keyboard.press("Tab")
         name, outline = page.evaluate(FOCUS)
-        if name in seen[-1:] or name == "BODY":
+        if name.startswith("body"):  # after the last one
             break
         seen.append(name)
         assert outline >= 2, f"the focus on {name} is not seen"
