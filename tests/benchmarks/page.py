@@ -28,7 +28,7 @@ def _run_one(megapixels: float) -> dict[str, float]:
 
     from geodiff_plugin import read_calibration
     from geodiff_plugin.app import page, results
-    from geodiff_plugin.app.job import Priors, options_of, run_job
+    from geodiff_plugin.app.job import CameraFields, Priors, options_of, run_job
     from geodiff_plugin.app.shown import shown_of
     from geodiff_plugin.bundled.demo_pair import REAL_PAIRS_FOLDER
 
@@ -47,7 +47,8 @@ def _run_one(megapixels: float) -> dict[str, float]:
     priors.get("bundled")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB
     left, right = (str(folder / f"{side}.png") for side in photographs)
-    options = options_of(left, right, "numbers", baseline=float(rig.E[0, 3]), lens=lens, **RUN)
+    cameras = CameraFields("numbers", lens=lens, baseline=float(rig.E[0, 3]))
+    options = options_of(left, right, cameras, **RUN)
     shown = shown_of(run_job(options, priors, threading.Event(), lambda share, stage: None))
     page._drawn(shown, [], results.files_of(shown))
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB
