@@ -82,6 +82,7 @@ class PoseReport:
     matches: tuple[float, ...] = ()  # number of matches of each right view
     straightened_px: tuple[float, ...] = ()  # root mean square displacement of the right images; 0 for none
     scale_spread: float | None = None  # relative, of the scale of refined poses; None for measured baselines
+    depth_spread: float = 0.0  # median change of log depth by another pose that fits as well
     behind_infinity: float = math.nan  # share of the matches at which the rays of the poses as used diverge
     behind_px: float = math.nan  # how far behind infinity the farthest of them lie; 0 where hardly any do
     distortion: float = math.nan  # radial coefficient k1 that both pictures still have for certain
@@ -154,6 +155,10 @@ class Indicators:
     epipolar_px: float = math.nan  # median distance of matches from their epipolar lines, the worst view's
     given_px: float = math.nan  # the same distance under the poses as given
     scale_spread: float = math.nan  # relative standard deviation of a refined pose's scale, if in metres
+    depth_spread: float = math.nan  # median change of log depth by another pose that fits as well
+    straightened_px: float = (
+        math.nan
+    )  # root mean square by which no pose explains the matches, the worst view's
     behind_infinity: float = math.nan  # share of the matches at which the two cameras' rays diverge
     behind_px: float = math.nan  # how far behind infinity the farthest lie, pixels of the left image
     distortion: float = math.nan  # k1 that both pictures still have for certain

@@ -155,7 +155,8 @@ def _refined(misfit: _Misfit, report: PoseReport) -> _Refined:
     after, worst = median_residuals(tracks, Ts), int(np.argmax(np.nan_to_num(before)))
     residual_px, matches = tuple(before.tolist()), tuple(map(float, tracks.seen.sum(1)))
     report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
-    doubts = () if misfit.rig else undecided(tracks, Ts, free)  # a calibration determines the pose
+    apart = 0.0 if misfit.rig else depths_apart(tracks, Ts, free)  # a calibration determines the pose
+    report, doubts = replace(report, depth_spread=apart), _undetermined(apart)
     if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
         warnings = _kept_misfit(before, worst) + doubts
         return tuple(rights), replace(report, status="kept", warnings=warnings)
@@ -328,16 +329,20 @@ def _messages(
     return distinct(message for message in found if message is not None)
 
 
-def undecided(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> tuple[Message, ...]:
-    """A message where the matches do not determine the pose, and with it the depth."""
+def depths_apart(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> float:
+    """Median difference in log depth of the matches under poses ``Ts`` and ``free``, ``(V, 4, 4)`` each."""
     used, other = (solve_inverse_depth(tracks, poses) for poses in (Ts, free))
     ahead = (used > 0) & (other > 0)
-    spread = float(np.median(np.abs(np.log(used[ahead] / other[ahead])))) if ahead.any() else 0.0
-    if spread < _MOST_SPREAD:
+    return float(np.median(np.abs(np.log(used[ahead] / other[ahead])))) if ahead.any() else 0.0
+
+
+def _undetermined(apart: float) -> tuple[Message, ...]:
+    """A message where the matches do not determine the pose, and with it the depth."""
+    if apart <= _MOST_SPREAD:
         return ()
     sentence = (
         "The matches do not determine the pose: another one fits them as well, and its depths differ by "
-        f"{100 * np.expm1(spread):.0f} % in the median. Give a more exact pose, or views from further apart."
+        f"{100 * np.expm1(apart):.0f} % in the median. Give a more exact pose, or views from further apart."
     )
     return (Message("pose.undetermined", sentence),)
 

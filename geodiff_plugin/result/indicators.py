@@ -140,6 +140,8 @@ def indicators_of(
         for name, residuals in (("epipolar_px", pose.residual_px), ("given_px", pose.residual_px_given)):
             known[name] = max((px for px in residuals if not math.isnan(px)), default=math.nan)
         known |= {"behind_infinity": pose.behind_infinity, "distortion": pose.distortion}
+        known["depth_spread"] = pose.depth_spread
+        known["straightened_px"] = max(pose.straightened_px, default=0.0)
         known["behind_px"] = pose.behind_px * pixels_of_matches(native.size)
         known["mistakes"] = tuple(m for m in pose.warnings if m.forbids_trust and m.code != INVERSE.code)
     if native.views and has_unit:

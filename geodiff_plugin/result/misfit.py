@@ -25,8 +25,14 @@ MATCH_NOISE_PX = 0.25
 #: Residual of the matches across their epipolar lines that right pairs have, pixels of their grid: as much
 #: error as there is beyond it is expected along the lines, where it changes depth.
 USUAL_PX = 0.45
+#: Root mean square displacement of right images that brings matches of right pairs to their lines, pixels.
+USUAL_BEND_PX = 1.0
 #: Radial coefficient k1 that right pairs seem to have.
 USUAL_DISTORTION = 0.08
+#: Relative standard deviation of the scale of refined poses of right pairs.
+USUAL_SCALE = 0.06
+#: Change of log depth by another pose that fits a right pair as well.
+USUAL_SPREAD = 0.14
 
 
 class Misfit(NamedTuple):
@@ -34,6 +40,7 @@ class Misfit(NamedTuple):
 
     px: float = 0.0  # standard deviation of the shift between the views, pixels of the left image
     distortion: float = 0.0  # size of the radial coefficient k1 that both pictures still have
+    relative: float = 0.0  # relative standard deviation of all depths together
 
 
 NO_MISFIT = Misfit()
@@ -41,12 +48,20 @@ NO_MISFIT = Misfit()
 
 def misfit_of(found: Indicators, size: tuple[int, int]) -> Misfit:
     """The misfit of a run on a left image of ``size`` ``(H, W)``, by its indicators; 0 where unknown."""
-    across, behind, bent = (
-        0.0 if math.isnan(value) else abs(value)
-        for value in (found.epipolar_px, found.behind_px, found.distortion)
+    across_px = math.hypot(
+        _beyond(found.epipolar_px, USUAL_PX), _beyond(found.straightened_px, USUAL_BEND_PX)
     )
-    beyond_usual = math.sqrt(max(0.0, across**2 - USUAL_PX**2)) * pixels_of_matches(size)
-    return Misfit(math.hypot(beyond_usual, behind), max(0.0, bent - USUAL_DISTORTION))
+    behind_px = _beyond(found.behind_px, 0.0)
+    return Misfit(
+        math.hypot(across_px * pixels_of_matches(size), behind_px),
+        0.0 if math.isnan(found.distortion) else max(0.0, abs(found.distortion) - USUAL_DISTORTION),
+        math.hypot(_beyond(found.scale_spread, USUAL_SCALE), _beyond(found.depth_spread, USUAL_SPREAD)),
+    )
+
+
+def _beyond(deviation: float, usual: float) -> float:
+    """Standard deviation that a usual one leaves of another; 0 where that is unknown."""
+    return 0.0 if math.isnan(deviation) else math.sqrt(max(0.0, deviation**2 - usual**2))
 
 
 def expected_error(
@@ -60,9 +75,10 @@ def expected_error(
 
     For a general pose ``(z - t_z)^2 sigma_d / |f (t_xy - r_xy t_z)|``, with the pixel's ray ``r`` and the
     right camera's centre ``t``; the least over ``poses (4, 4)``. Rotations do not change it. ``sigma_d`` is
-    the noise of a match and the ``misfit`` in pixels. A relative error ``scale_spread`` of the poses' length
-    adds to it, and the share ``k1 (|r_xy|^2 + 2 r_b^2)`` by which a distortion of both pictures changes the
-    shift between the views, with ``r_b`` the part of ``r_xy`` along the epipolar line.
+    the noise of a match and the ``misfit`` in pixels. Relative errors add to it: ``scale_spread``, that of
+    the poses' length, or that of the misfit, if larger, and the share ``k1 (|r_xy|^2 + 2 r_b^2)`` by which a
+    distortion of both pictures changes the shift between the views, ``r_b`` being the part of ``r_xy`` along
+    the epipolar line.
     """
     height, width = depth_m.shape
     error_m = np.empty((height, width))
@@ -81,7 +97,7 @@ def expected_error(
                 along = (ray_x * moved_x + ray_y * moved_y) ** 2 / (moved_x**2 + moved_y**2 + 1e-12)
                 error = np.hypot(error, misfit.distortion * (ray_x**2 + ray_y**2 + 2.0 * along) * z_m)
             best = np.minimum(best, error)
-        error_m[rows] = np.hypot(best, scale_spread * z_m)
+        error_m[rows] = np.hypot(best, max(scale_spread, misfit.relative) * z_m)
     return error_m
 
 

@@ -16,10 +16,10 @@ from geodiff_plugin.types import Indicators, Verdict
 
 #: A depth that differs from the matches by this in the median of the absolute log is not trusted.
 OFF_MATCHES = math.log(1.2)
-#: Below this mean confidence a result is not to be trusted. Right pairs, real and rendered, had .66 to .98;
+#: Below this mean confidence a result is not to be trusted. Right pairs, real and rendered, had .54 to .98;
 #: where nothing is matched, confidence is about .45.
 LEAST_CONFIDENCE = 0.5
-#: The same for the share matched, which was .32 to .96 for right pairs.
+#: The same for the share matched, which was .39 to .96 for right pairs.
 LEAST_MATCHED = 0.12
 #: The same for the rank correlation of near and far, which was +.18 to +.97 for right pairs.
 MOST_EXCHANGED = -0.2
@@ -28,9 +28,9 @@ LEAST_CORRELATION = 0.2
 #: Share matched from which the prior is rather to blame.
 MATCHED_ENOUGH = 0.5
 #: Below this mean confidence it is a weak indicator; two weak ones together count as a bad one.
-WEAK_CONFIDENCE = 0.6
+WEAK_CONFIDENCE = 0.53
 #: Below this share matched it is a weak one.
-WEAK_MATCHED = 0.4
+WEAK_MATCHED = 0.38
 #: Below this rank correlation it is a weak one.
 WEAK_CORRELATION = 0.45
 #: Beyond this distance of matches from their epipolar lines, pixels, it is a weak one.

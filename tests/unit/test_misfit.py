@@ -8,8 +8,10 @@ import pytest
 import torch
 from scipy.stats import norm
 
+from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.result.indicators import indicators_of
 from geodiff_plugin.result.misfit import NO_MISFIT, Misfit, expected_error, misfit_of, share_left
-from geodiff_plugin.types import CameraView, Indicators
+from geodiff_plugin.types import CameraView, Indicators, PosedViews, PoseReport
 
 K = np.array([[100.0, 0, 63.5], [0, 100.0, 47.5], [0, 0, 1]])
 SIZE = (96, 128)
@@ -30,17 +32,24 @@ def view_at(*centre: float) -> CameraView:
 @pytest.mark.parametrize(
     ("found", "size", "expected"),
     [
-        ({}, SIZE, (0, 0)),
+        ({}, SIZE, (0, 0, 0)),
         # Of right pairs: matches within 0.45 px of their lines, k1 up to .08.
-        ({"epipolar_px": 0.44, "behind_px": 0.0, "distortion": -0.079}, SIZE, (0, 0)),
-        ({"epipolar_px": 0.75}, SIZE, (0.6, 0)),  # .75^2 = .45^2 + .6^2
-        ({"behind_px": 3.0}, SIZE, (3.0, 0)),
-        ({"epipolar_px": 0.75, "behind_px": 0.8}, SIZE, (1.0, 0)),
-        ({"distortion": 0.081}, SIZE, (0, 0.001)),
-        ({"distortion": -0.25}, SIZE, (0, 0.17)),
+        ({"epipolar_px": 0.44, "behind_px": 0.0, "distortion": -0.079}, SIZE, (0, 0, 0)),
+        # Refined poses of right pairs: bent by up to 1 px, a scale known to 6 %, others 14 % apart.
+        ({"straightened_px": 0.99, "scale_spread": 0.059, "depth_spread": 0.139}, SIZE, (0, 0, 0)),
+        ({"epipolar_px": 0.75}, SIZE, (0.6, 0, 0)),  # .75^2 = .45^2 + .6^2
+        ({"behind_px": 3.0}, SIZE, (3.0, 0, 0)),
+        ({"epipolar_px": 0.75, "behind_px": 0.8}, SIZE, (1.0, 0, 0)),
+        ({"straightened_px": 1.25}, SIZE, (0.75, 0, 0)),
+        ({"straightened_px": 1.25, "epipolar_px": 0.75}, SIZE, (math.hypot(0.75, 0.6), 0, 0)),
+        ({"distortion": 0.081}, SIZE, (0, 0.001, 0)),
+        ({"distortion": -0.25}, SIZE, (0, 0.17, 0)),
+        ({"scale_spread": 0.1}, SIZE, (0, 0, 0.08)),
+        ({"depth_spread": 0.25}, SIZE, (0, 0, math.sqrt(0.25**2 - 0.14**2))),
+        ({"scale_spread": 0.1, "depth_spread": 0.25}, SIZE, (0, 0, math.sqrt(0.08**2 + 0.25**2 - 0.14**2))),
         # Residuals are in pixels of a grid of 832 columns at most, what lies behind infinity in the image's.
-        ({"epipolar_px": 0.75, "behind_px": 0.0}, (900, 1664), (1.2, 0)),
-        ({"behind_px": 3.0}, (900, 1664), (3.0, 0)),
+        ({"epipolar_px": 0.75, "behind_px": 0.0}, (900, 1664), (1.2, 0, 0)),
+        ({"behind_px": 3.0}, (900, 1664), (3.0, 0, 0)),
     ],
 )
 def test_only_what_right_pairs_do_not_have_is_a_misfit(found, size, expected):
@@ -53,6 +62,14 @@ def test_an_error_of_the_shift_adds_to_that_of_a_match(centre):
     poses = [camera_at(*centre)]
     found = expected_error(depth_m, K, poses, misfit=Misfit(px=0.6))
     np.testing.assert_allclose(found, expected_error(depth_m, K, poses) * math.hypot(0.25, 0.6) / 0.25)
+
+
+def test_the_larger_of_two_errors_of_all_depths_together_counts():
+    depth_m, poses = np.full(SIZE, 3.0), [camera_at(0.1, 0, 0)]
+    alone = expected_error(depth_m, K, poses)
+    for scale_spread, relative, larger in ((0.05, 0.2, 0.2), (0.2, 0.05, 0.2), (0.0, 0.1, 0.1)):
+        found = expected_error(depth_m, K, poses, scale_spread, Misfit(relative=relative))
+        np.testing.assert_allclose(found, np.hypot(alone, larger * 3.0))
 
 
 @pytest.mark.parametrize("centre", [(0.1, 0, 0), (0.0, 0.1, 0), (0.07, 0.07, 0)])
@@ -101,3 +118,17 @@ def test_of_several_views_the_best_counts():
     )
     torch.testing.assert_close(both, alone)
     assert (share_left(depth_m, torch.from_numpy(K), [near], Misfit(px=1.0)) < alone).all()
+
+
+def test_the_indicators_of_a_run_hold_the_worst_view_in_pixels_of_the_left_image():
+    """Poses are checked on a grid of 832 columns at most: two pixels of this image are one of it."""
+    left = torch.zeros(3, 20, 1664)
+    views = tuple(
+        CameraView(left, torch.from_numpy(K), torch.from_numpy(camera_at(-0.1, 0, 0))) for _ in "ab"
+    )
+    pose = PoseReport(
+        "refined", (), (), straightened_px=(0.5, 1.5), behind_px=2.0, depth_spread=0.2, scale_spread=0.1
+    )
+    native = PosedViews(left, views, torch.from_numpy(K))
+    found = indicators_of(Evidence(native, native, None, None, pose=pose), {})
+    assert (found.straightened_px, found.behind_px, found.depth_spread) == (1.5, 4.0, 0.2)

@@ -15,7 +15,7 @@ from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.pose import refine
 from geodiff_plugin.pose.lens import remaining_distortion
 from geodiff_plugin.pose.mistakes import find_mistake
-from geodiff_plugin.pose.refine import fit_displacement, refine_views, straightened, undecided
+from geodiff_plugin.pose.refine import depths_apart, fit_displacement, refine_views, straightened
 from geodiff_plugin.pose.solve import PosePrior, is_rig, settle_poses, solve_poses
 from geodiff_plugin.pose.tracks import (
     Tracks,
@@ -110,9 +110,18 @@ def test_a_shift_that_makes_up_for_a_turn_comes_back() -> None:
     given = np.linalg.inv(wrong)[None]
     assert np.median(residuals_px(tracks, given)) < 1.0
     assert depth_error(tracks, settled(tracks, given), depth_m) < 0.5 * depth_error(tracks, given, depth_m)
-    assert undecided(tracks, Ts, Ts) == ()
-    other = np.linalg.inv(TRUE @ pose((0.0, 1.0, 0.0), (0, 0, 0)))[None]
-    assert "do not determine the pose" in undecided(tracks, Ts, other)[0]
+    assert depths_apart(tracks, Ts, Ts) == 0.0
+    longer = Ts.copy()
+    longer[:, :3, 3] *= 1.2
+    assert depths_apart(tracks, Ts, longer) == pytest.approx(np.log(1.2), rel=0.05)
+    assert depths_apart(tracks, longer, Ts) == pytest.approx(np.log(1.2), rel=0.05)
+
+
+@pytest.mark.parametrize(("apart", "told"), [(0.149, False), (0.151, True)])
+def test_a_pose_is_undetermined_where_another_one_gives_other_depths(apart: float, told: bool) -> None:
+    messages = refine._undetermined(apart)
+    assert bool(messages) is told
+    assert all(f"differ by {100 * np.expm1(apart):.0f} %" in each for each in messages)
 
 
 def test_the_refinement_is_joint_and_reaches_the_optimum() -> None:
@@ -397,7 +406,7 @@ def test_a_calibrated_rig_keeps_its_calibration_where_all_matches_fit_it(monkeyp
 
 def test_a_rig_is_not_told_that_another_pose_fits_as_well(monkeypatch) -> None:
     """Its calibration determines the pose; poses of a tracker do not, and forbid trust then."""
-    monkeypatch.setattr(refine, "_MOST_SPREAD", -1.0)  # however little the depths of the two differ
+    monkeypatch.setattr(refine, "_MOST_SPREAD", 0.0)  # however little the depths of the two differ
     rig = render_pair(3, size=(240, 320))
     for turn_deg, told in ((0.0, False), (0.7, True)):
         E = rig.E.numpy() @ pose((turn_deg, 0.0, 0.0), (0, 0, 0))
@@ -406,3 +415,4 @@ def test_a_rig_is_not_told_that_another_pose_fits_as_well(monkeypatch) -> None:
         _, report = refine_views(rig.left.image_01.float(), views, rig.K_left.float())
         messages = [m for m in report.warnings if m.code == "pose.undetermined"]
         assert bool(messages) == told and all(m.forbids_trust for m in messages), report
+        assert (report.depth_spread > 0.0) is told
