@@ -39,6 +39,11 @@ LEAST_SHARPNESS = 0.1
 KNOWN_REACH = CONTRAST_REACH
 #: Mean precision, one over squared planes, of a window in which the matches know enough.
 ENOUGH_KNOWN = 0.3
+#: Least deviation of a match, in planes, that counts: finer positions between planes are chance.
+LEAST_DEVIATION = 0.5
+#: Planes from infinity up to which an error of one plane is so large a share of the inverse depth that the
+#: matches have to be more precise than ``ENOUGH_KNOWN``, in inverse proportion to their number.
+FAR_PLANES = 50.0
 # It grows by this factor at most.
 _MOST_BLUR = 100.0
 # Only every second row of the right view is matched.
@@ -201,9 +206,32 @@ def known_share(matches: Matches) -> Tensor:
     share of ``ENOUGH_KNOWN``; a pixel without a match has none, a known point that of the pixels that it
     stands for (see ``with_points``). 1 where no deviation is known.
     """
+    return _mean_precision(matches, 1.0).clamp_max(1.0)
+
+
+@torch.no_grad()
+def known_shape(matches: Matches, inverse_depth: Tensor) -> Tensor:
+    """How much the matches around every pixel know of the shape of a surface, ``(B, 1, H, W)`` in [0, 1].
+
+    As ``known_share``, but more precise matches count for more, and fewer planes from infinity ask for more
+    precise ones: an error of a plane bends a far wall more than a near one.
+
+    Args:
+        matches: of the images.
+        inverse_depth: ``(B, 1, H, W)`` 1/m of the surfaces, on the grid of the matches.
+    """
+    planes = inverse_depth / matches.plane_step.view(-1, 1, 1, 1)
+    return (_mean_precision(matches, LEAST_DEVIATION) * (planes / FAR_PLANES).clamp_max(1.0)).clamp_max(1.0)
+
+
+def _mean_precision(matches: Matches, least_deviation: float) -> Tensor:
+    """Mean precision of a window of matches as a share of ``ENOUGH_KNOWN``, ``(B, 1, H, W)`` >= 0.
+
+    A match deviates by ``least_deviation`` planes at least.
+    """
     if matches.deviation is None:
         return torch.ones_like(matches.confidence)
-    precision = matches.deviation.clamp_min(1.0) ** -2 * matches.confidence.clamp_min(1.0)
+    precision = matches.deviation.clamp_min(least_deviation) ** -2 * matches.confidence.clamp_min(1.0)
     precision = torch.where(matches.confidence > 0, precision, torch.zeros_like(precision))
     mean = torch.stack([_window_mean(of_image[0], KNOWN_REACH)[None] for of_image in precision])
-    return (mean / ENOUGH_KNOWN).clamp_max(1.0)
+    return mean / ENOUGH_KNOWN

@@ -193,9 +193,10 @@ def _error_of(members: Sequence[Member]) -> Tensor | None:
 def refine(
     evidence: Evidence, members: Sequence[Member], depth_m: Tensor, left_01: Tensor, config: GuidanceConfig
 ) -> Refined | None:
-    """Sharpen the edges of a map of these members, fit it to its matches, flatten it, and let these vote.
+    """Sharpen the edges of a map of these members, fit it to its matches, let these vote, and flatten it.
 
-    Edges are sharpened first: then the fit does not carry the depth of one surface over to the next.
+    Edges are sharpened first: then the fit does not carry the depth of one surface over to the next. Walls
+    are flattened last, as votes make patches of a wall whose matches are not precise.
     ``left_01 (1, 3, H, W)`` has the size of the map. ``None`` if there are neither matches nor points.
     """
     matches, points = Matches.stack([evidence.matches]), Matches.stack([evidence.points])
@@ -210,11 +211,11 @@ def refine(
     fitted_m, support, _ = fit_depth(depth_m, target, evidence.native.left_01[None], error, config)
     if matches is not None:
         measured = error.amin((2, 3), keepdim=True)  # its value where the prior gives a depth
-        fitted_m = flatten(fitted_m, target, left_01, measured)
         target = correction_target(matches, points, weight, error, fitted_m)
         assert target is not None  # there are matches
         known = known_share(target)
         fitted_m = vote_depth(fitted_m, evidence, target, known, measured, spacing)
+        fitted_m = flatten(fitted_m, target, left_01, measured)
         support = support * determined(known, image_size(support))
     return Refined(fitted_m, support)
 

@@ -16,13 +16,13 @@ from torch import Tensor
 from geodiff_plugin.algorithm.correction import edge_links, log_depth_at
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
 from geodiff_plugin.geometry import image_size
-from geodiff_plugin.matching import Matches, known_share
+from geodiff_plugin.matching import Matches, known_shape
 
 #: How much a slope resists its neighbours' where nothing is known: all slopes count a little, as a wall on
 #: which nothing is known has no others.
-LEAST_SLOPE_WEIGHT = 0.02
+LEAST_SLOPE_WEIGHT = 0.01
 #: Smoothness of the slopes: over about the root of its ratio to their own weight, in pixels, they are alike.
-SLOPE_SMOOTHNESS = 200.0
+SLOPE_SMOOTHNESS = 300.0
 #: Weight of the smoothed slopes against that of the values.
 SLOPES = 40.0
 #: Weight of a value where nothing is known, for a prior of ``WEAK_PRIOR`` or worse: it holds wide shapes.
@@ -42,14 +42,14 @@ LEAST_SHARE = 0.3
 def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor) -> Tensor:
     """Make the slopes of inverse depth alike where the matches know little, and leave the rest as it is.
 
-    With ``q`` the inverse depth, ``k`` the known share of the matches around a pixel, and ``g`` links that
-    fall at edges of image and depth, the slopes ``s`` of ``q`` along either axis are smoothed to ``t =
-    argmin sum g (k^2 + LEAST_SLOPE_WEIGHT) (t - s)^2 + SLOPE_SMOOTHNESS sum g |grad t|^2``. The result is ``q
-    + e`` with ``e = argmin sum w e^2 + SLOPES sum g |grad (q + e) - t|^2`` and ``w = k^2 / (1 - k) + w_0``,
-    where ``w_0`` is ``LEAST_VALUE_WEIGHT`` of a weak prior, and more of a better one.
+    With ``q`` the inverse depth, ``k`` the ``known_shape`` of the matches, and ``g`` links that fall at edges
+    of image and depth, the slopes ``s`` of ``q`` along either axis are smoothed to ``t = argmin sum g (k^2 +
+    LEAST_SLOPE_WEIGHT) (t - s)^2 + SLOPE_SMOOTHNESS sum g |grad t|^2``. The result is ``q + e`` with ``e =
+    argmin sum w e^2 + SLOPES sum g |grad (q + e) - t|^2`` and ``w = k^2 / (1 - k) + w_0``, where ``w_0`` is
+    ``LEAST_VALUE_WEIGHT`` of a weak prior, and more of a better one.
 
     Args:
-        depth_m: ``(1, 1, H, W)`` metres, fitted to the matches.
+        depth_m: ``(1, 1, H, W)`` metres, fitted to the matches and voted on by them.
         target: the matches.
         left_01: ``(1, 3, h, w)`` in [0, 1], the left image at any resolution.
         error: ``(1, 1, 1, 1)`` of the prior in log depth.
@@ -57,8 +57,8 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor) ->
     Returns:
         As ``depth_m``.
     """
-    known = known_share(target)
     log_depth = log_depth_at(depth_m, target.size)
+    known = known_shape(target, torch.exp(-log_depth))
     guide = F.interpolate(left_01.float(), target.size, mode="bilinear", antialias=True)
     inverse = torch.exp(log_depth.mean() - log_depth)  # about 1, so that no weight depends on the unit
     links = tuple(edge_links(guide, log_depth, axis) for axis in (-1, -2))
