@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from geodiff_plugin.matching import Matches, known_share, match_volume, sweep_planes, with_points
-from geodiff_plugin.matching.consistency import DOUBT_OF_A_PLANE, ENOUGH_KNOWN
+from geodiff_plugin.matching import Matches, known_shape, known_share, match_volume, sweep_planes, with_points
+from geodiff_plugin.matching.consistency import DOUBT_OF_A_PLANE, ENOUGH_KNOWN, FAR_PLANES, LEAST_DEVIATION
 from geodiff_plugin.result.confidence import DETERMINED_FROM, determined
 from geodiff_plugin.result.flattening import flatten
 from geodiff_plugin.types import CameraView
@@ -50,6 +50,20 @@ def test_a_pixel_without_a_match_knows_nothing_and_points_stand_for_their_surrou
     points = Matches(0.5 * given, given, torch.tensor([0.01]))
     known = known_share(with_points(matches_of(30.0), points))
     assert (known[..., 16:-16, 16:-16] == 1.0).all()
+
+
+def test_a_far_surface_asks_for_more_precise_matches_than_a_near_one() -> None:
+    """At half of ``FAR_PLANES`` twice the precision is needed, and none counts beyond ``LEAST_DEVIATION``."""
+    step = 0.01
+    near, far = (torch.full((1, 1, *SIZE), planes * step) for planes in (2.0 * FAR_PLANES, 0.5 * FAR_PLANES))
+    matches = matches_of(2.0)
+    torch.testing.assert_close(known_shape(matches, near), torch.full_like(near, 0.25 / ENOUGH_KNOWN))
+    torch.testing.assert_close(known_shape(matches, far), torch.full_like(far, 0.125 / ENOUGH_KNOWN))
+    finest = torch.full_like(far, 0.1 * FAR_PLANES * step)
+    expected = 0.1 * LEAST_DEVIATION**-2 / ENOUGH_KNOWN
+    torch.testing.assert_close(
+        known_shape(matches_of(0.01), finest), torch.full_like(far, min(1.0, expected))
+    )
 
 
 def test_matches_that_know_little_determine_little() -> None:
