@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,6 +38,8 @@ from geodiff_plugin.messages import Message
 
 #: A note names so many of the frames that are left out, at most.
 MOST_NAMES = 5
+#: Letters of a name in a note, at most: a file may give a frame a name of any length.
+LONGEST_NAME = 60
 #: It gives so many of their reasons, at most.
 MOST_REASONS = 3
 
@@ -85,7 +88,7 @@ def read_capture(
     ``trajectory`` has a video's lines ``seconds tx ty tz qx qy qz qw``, camera-to-world, OpenCV's axes.
     """
     source = Path(path)
-    if not source.exists():
+    if not os.path.exists(source):
         bad_value("PATH", "a capture", f"{source}, which does not exist", error=MissingFileError)
     with reading_whole(source, "capture"):
         layout = _layout(source, None if trajectory is None else Path(trajectory))
@@ -127,7 +130,7 @@ def _finished(candidate: Candidate, as_stored: bool, typed: TypedCamera) -> Cand
     """The frame with its size and K, or what is wrong with it."""
     if candidate.problem:
         return candidate
-    if not candidate.frame.image.is_file():
+    if not os.path.isfile(candidate.frame.image):
         return _left_out(candidate, "no image file")
     try:
         return replace(candidate, frame=_with_camera(candidate.frame, candidate.camera, as_stored, typed))
@@ -154,7 +157,7 @@ def _with_camera(
     else:
         K = intrinsics_from_exif(frame.image, name, as_stored=as_stored)[0]
     lens = None if camera is None else lens_of(camera, name)
-    depth = frame.depth if frame.depth is not None and frame.depth.is_file() else None
+    depth = frame.depth if frame.depth is not None and os.path.isfile(frame.depth) else None
     return replace(frame, size=size, K=np.asarray(K, float), lens=lens, depth=depth, as_stored=as_stored)
 
 
@@ -191,4 +194,7 @@ def _reasons(candidates: Sequence[Candidate]) -> list[Message]:
 
 
 def _some(names: Sequence[str]) -> str:
-    return f"{', '.join(names[:MOST_NAMES])}{', ...' * (len(names) > MOST_NAMES)}"
+    shown = [
+        name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}..." for name in names[:MOST_NAMES]
+    ]
+    return f"{', '.join(shown)}{', ...' * (len(names) > MOST_NAMES)}"

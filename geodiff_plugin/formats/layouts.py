@@ -89,7 +89,7 @@ def images_of(paths: Iterable[Path]) -> list[Path]:
 
 def images_in(folder: Path) -> list[Path]:
     """The images of a folder, numbers in names in order; none where there is no folder."""
-    return images_of(folder.iterdir()) if folder.is_dir() else []
+    return images_of(folder.iterdir()) if os.path.isdir(folder) else []
 
 
 def image_folders(*folders: Path) -> list[Path]:
@@ -168,7 +168,7 @@ class _Finder:
         for start in range(len(parts)):
             for folder in self._folders:
                 path = folder.joinpath(*parts[start:])
-                if path.is_file() and path.suffix.lower() in IMAGES:
+                if os.path.isfile(path) and path.suffix.lower() in IMAGES:
                     return path, start == 0
             for folder in self._folders:
                 alike = self._stems(folder.joinpath(*parts[start:-1])).get(_stem(parts[-1]), [])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -193,11 +194,11 @@ def transforms_of(path: Path) -> TransformsFile | None:
 
 def named_in_transforms(file: TransformsFile | None, name: Any) -> Path | None:
     """A file that an entry names, if it lies at or below the folder of the ``transforms.json``."""
-    if file is None or not isinstance(name, str):
+    if file is None or not isinstance(name, str) or "\0" in name:
         return None
     folder = file.path.parent.resolve()
     path = (folder / name.replace("\\", "/")).resolve()
-    return path if path.is_relative_to(folder) and path.is_file() else None
+    return path if path.is_relative_to(folder) and os.path.isfile(path) else None
 
 
 def _folders(file: Path) -> list[Path]:
@@ -221,7 +222,7 @@ def _build(frame: CaptureFrame, entries: Frame, folder: Path) -> Candidate:
     named = next((entries[key] for key in DEPTHS if entries.get(key)), None)
     names = [f"depth/{frame.image.stem}{suffix}" for suffix in DEPTH_SUFFIXES] if named is None else [named]
     maps = (folder / str(name).replace("\\", "/") for name in names)
-    depth = next((map_ for map_ in maps if map_.is_file()), None)
+    depth = next((map_ for map_ in maps if os.path.isfile(map_)), None)
     posed = replace(frame, E=nerf_pose(entries), depth=depth, depth_per_m=_depth_per_m(entries))
     return Candidate(posed, camera)
 

@@ -224,7 +224,13 @@ def test_refusals(tmp_path) -> None:
         list_pairs(path, TOPICS, 1e-5)
     with pytest.raises(InputError, match="in the bag as /camera_info, or given; got neither"):
         stereo_calibration(path, ("/image", TOPICS[1]))
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(path.read_bytes()[:3000])
-    with pytest.raises(InputError, match="LEFT must be a whole bag; got"):
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.98])
+def test_a_bag_that_is_cut_off_is_a_sentence(share, suffix, tmp_path):
+    whole = write_bag(tmp_path / f"whole{suffix}").read_bytes()
+    cut = tmp_path / f"cut{suffix}"
+    cut.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(InputError, match=r"cut\.(mcap|bag).*(cut off|empty)"):
         list_pairs(cut, TOPICS, 0.005)

@@ -18,6 +18,7 @@ from geodiff_plugin.formats.clouds import Cloud
 from geodiff_plugin.formats.colmap import MODELS, write_colmap
 from geodiff_plugin.formats.images import in_stored_pixels
 from geodiff_plugin.formats.lenses import undistorted_pixels
+from geodiff_plugin.formats.transforms import named_in_transforms, transforms_of
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.reading import read_pair
 from geodiff_plugin.jobs.telling import say
@@ -329,6 +330,58 @@ def test_a_hostile_name_stays_inside_the_output_and_out_of_the_terminal(stem, tm
     assert len(left) == 3
     say(left.notes[0])
     assert "\x1b" not in capsys.readouterr().err
+
+
+def hostile_transforms(folder: Path, name: str) -> None:
+    data = json.loads((transforms(folder) / "transforms.json").read_text())
+    data["frames"][1]["file_path"] = name
+    data["frames"][2]["depth_file_path"] = name
+    (folder / "transforms.json").write_text(json.dumps(data))
+
+
+def hostile_text(folder: Path, name: str) -> None:
+    file = colmap_text(folder) / "sparse/0/images.txt"
+    file.write_bytes(file.read_bytes().replace(b"f01.png", name.encode()))
+
+
+def hostile_binary(folder: Path, name: str) -> None:
+    file = colmap_binary(folder) / "sparse/0/images.bin"
+    file.write_bytes(file.read_bytes().replace(b"f01.png", name.encode()))
+
+
+HOSTILE = {
+    "above": "../../../../../../../../etc/passwd",
+    "absolute": "/etc/passwd",
+    "device": "/dev/zero",
+    "null": "a\0b.png",
+    "line": "a\nb.png",
+    "long": "x" * 5000 + ".png",
+    "deep": "a/" * 3000 + "b.png",
+    "windows": "C:\\..\\..\\x.png",
+    "share": "//server/share/x.png",
+    "folder": "images/",
+    "dots": "..",
+    "empty": "",
+    "escape": "\x1b[2J.png",
+}
+
+
+@pytest.mark.parametrize(
+    "write", [hostile_transforms, hostile_text, hostile_binary], ids=lambda w: w.__name__
+)
+@pytest.mark.parametrize("name", HOSTILE.values(), ids=HOSTILE)
+def test_a_hostile_name_in_a_file_of_cameras_leaves_out_its_frame_alone(write, name, tmp_path, capsys):
+    write(tmp_path, name)
+    capture = Capture.open(tmp_path)
+    assert capture.names == ["f00", "f02", "f03"]
+    for frame in capture.frames:
+        assert frame.image.resolve().parent == (tmp_path / "images").resolve()
+    for note in capture.notes:
+        say(note)
+    said = capsys.readouterr().err
+    assert all(len(line) < 1000 and line.isprintable() for line in said.splitlines())
+    file = transforms_of(tmp_path) if write is hostile_transforms else None
+    assert file is None or named_in_transforms(file, name) is None  # nothing of it is copied
 
 
 def test_images_of_one_name_in_two_folders_stay_apart(tmp_path):
