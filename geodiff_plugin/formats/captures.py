@@ -31,7 +31,13 @@ from geodiff_plugin.formats.layouts import (
 from geodiff_plugin.formats.phones import read_polycam, read_record3d, read_stray
 from geodiff_plugin.formats.photogrammetry import read_bundler, read_metashape, read_nvm, read_opensfm
 from geodiff_plugin.formats.rigs import RATIO_TOLERANCE, Camera, lens_of, reading_whole, resized
-from geodiff_plugin.formats.sequences import read_photographs, read_tracked, read_tum, read_video
+from geodiff_plugin.formats.sequences import (
+    read_photographs,
+    read_replica,
+    read_tracked,
+    read_tum,
+    read_video,
+)
 from geodiff_plugin.formats.transforms import read_transforms
 from geodiff_plugin.formats.unknown import refuse_foreign, refuse_unknown
 from geodiff_plugin.messages import Message
@@ -53,6 +59,7 @@ LAYOUTS = (
     CaptureFormat("7-Scenes", ("frame-*.color.*", "frame-*.pose.txt"), read_tracked),
     CaptureFormat("ScanNet", ("color", "pose", "intrinsic"), read_tracked),
     CaptureFormat("TUM RGB-D", ("rgb.txt", "groundtruth.txt"), read_tum),
+    CaptureFormat("Replica", ("results/frame*", "traj.txt"), read_replica),
     CaptureFormat("EuRoC", ("*/cam0/sensor.yaml", "*/cam0/data.csv"), read_euroc),
     CaptureFormat("TartanAir", ("image_left", "pose_left.txt"), read_tartanair),
     CaptureFormat("KITTI odometry", ("image_[0-3]", "calib.txt", "poses.txt"), read_kitti_odometry),

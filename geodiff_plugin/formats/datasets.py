@@ -25,7 +25,7 @@ from geodiff_plugin.formats.layouts import (
     images_in,
 )
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, pose_of, rigid
-from geodiff_plugin.formats.robotics import euroc_camera
+from geodiff_plugin.formats.robotics import body_from_camera, euroc_camera
 from geodiff_plugin.formats.sequences import poses_by_time
 from geodiff_plugin.formats.storage import read_yaml
 from geodiff_plugin.messages import Message
@@ -52,7 +52,7 @@ def read_euroc(path: Path) -> Layout | None:
 def _euroc(folder: Path, truth: Path) -> Layout:
     images = folder / "cam0" / "data"
     entries = read_yaml(read_text(folder / "cam0" / "sensor.yaml", "sensor.yaml"))
-    camera, T_body_camera = euroc_camera(entries), rigid(entries["T_BS"]["data"], "T_BS")
+    camera, T_body_camera = euroc_camera(entries), body_from_camera(entries)
     rows = array_of([row[:8] for row in read_rows(truth, f"{truth}", "poses")], (-1, 8), "lines of 8")
     pose_at = poses_by_time(rows[:, 0] / NS_PER_S, rows[:, 1:4], rows[:, [5, 6, 7, 4]])  # w comes first
 

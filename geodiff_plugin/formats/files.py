@@ -51,9 +51,23 @@ def check_file(path: PathLike, name: str, what: str = "a file") -> Path:
         bad_value(name, what, f"{path}, which you may not read", "Check its permissions.", InputFileError)
     if file.stat().st_size == 0:
         bad_value(name, what, f"{path}, which is empty", "Was its download or copy cut off? Fetch it again.")
+    _refuse_stand_in(file, name, what)
     return file
 
 
+def _refuse_stand_in(file: Path, name: str, what: str) -> None:
+    """Refuse what failed downloads leave in the place of a file."""
+    with file.open("rb") as opened:
+        head = opened.read(STAND_IN_BYTES).lstrip().lower()
+    if head.startswith(b"version https://git-lfs"):
+        bad_value(name, what, f"{file}, a pointer of Git LFS", "Fetch the file itself: git lfs pull.")
+    if head.startswith((b"<!doctype html", b"<html")):
+        cure = "Its download gave an error or a log-in page: fetch it again."
+        bad_value(name, what, f"{file}, a web page", cure)
+
+
+#: Bytes by which a web page and a pointer of Git LFS are recognised.
+STAND_IN_BYTES = 64
 MAP_SUFFIXES = (".npy", ".npz", ".pfm", ".png")
 DECODE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, KeyError, EOFError, zlib.error)
 

@@ -24,6 +24,8 @@ DARK_16_BITS = 8192
 #: Formats that hold several frames or pages of one kind; others hold previews.
 SEVERAL = ("GIF", "PNG", "TIFF", "WEBP")
 CHANNELS = (1, 3, 4)
+#: What HEIC files call the two pictures of a spatial photograph.
+STEREO_GROUP = "ster"
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _DIAGONAL_35_MM = math.hypot(36.0, 24.0)
 #: A focal length further off its EXIF than this factor is of an image of another size: EXIF is known to a few
@@ -118,10 +120,25 @@ def read_image(
     return image_01, notes
 
 
-def picture_count(path: PathLike, name: str) -> int:
-    """How many pictures an image file holds."""
+def pages_of_both(path: PathLike, name: str) -> tuple[int, int]:
+    """Numbers of the left and the right picture in an MPO or a spatial HEIC file.
+
+    Source: CIPA DC-007, whose stereo images are in order; ISO/IEC 23008-12: the first item of an entity group
+    ``ster`` is the left view.
+    """
     with open_image(path, name) as image:
-        return int(getattr(image, "n_frames", 1))
+        count, is_heic = int(getattr(image, "n_frames", 1)), image.format == "HEIF"
+        groups = image.info.get("entity_groups") or ()
+    if not is_heic:
+        if count != 2:
+            bad_value(name, "an MPO file with two pictures, left one first", f"{count} in {path}")
+        return 0, 1
+    pair = next((list(group["images"]) for group in groups if group["type"] == STEREO_GROUP), [])
+    if len(pair) != 2 or None in pair:
+        cure = "Give the right view as RIGHT. Of a spatial photograph pillow-heif 1.8 or later is needed."
+        expected = "a spatial HEIC file (entity group ster) where RIGHT is missing"
+        bad_value(name, expected, f"{path} with {count} pictures and no such group", cure)
+    return int(pair[0]), int(pair[1])
 
 
 def _hwc(value: Any, name: str) -> np.ndarray:

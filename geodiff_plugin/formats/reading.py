@@ -13,6 +13,7 @@ import numpy as np
 from geodiff_plugin._checks import UnknownFormatError, bad_type, bad_value, check_number, warn
 from geodiff_plugin.formats import colmap, devices, robotics, stereo, storage, transforms
 from geodiff_plugin.formats.files import PathLike
+from geodiff_plugin.formats.foreign import refuse_foreign_calibration
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
 from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Rig
@@ -34,6 +35,9 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "sceneflow": CalibrationFormat(
         "SceneFlow's camera_data.txt (Frame, L, R)", r"\A\s*Frame[ \t]+\d+[ \t]*\r?\n[ \t]*L[ \t]",
         stereo.read_sceneflow, by_image=True),
+    "vkitti": CalibrationFormat(
+        "Virtual KITTI's intrinsic.txt and extrinsic.txt (frame cameraID)", r"\A\s*frame[ \t]+cameraID\b",
+        stereo.read_vkitti, (2,)),
     "foundation_stereo": CalibrationFormat(
         "K.txt of FoundationStereo (9 numbers, baseline)", r"\A(?i:[-+.\de\s,]|nan|inf)+\Z",
         stereo.read_foundation_stereo),
@@ -95,6 +99,8 @@ def _texts(path: PathLike | Sequence[PathLike]) -> dict[Path, str]:
         bad_type("calibration", "a path, or a pair of paths (left, right)", path)
     if len(paths) == 1 and os.path.isdir(paths[0]):
         paths = colmap.model_files(Path(paths[0])) or paths
+    for file in paths:
+        refuse_foreign_calibration(Path(file))
     return {Path(file): _text(Path(file)) for file in paths}
 
 
@@ -110,9 +116,9 @@ def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
     for path, text in texts.items():
         fits = [name for name, each in CALIBRATION_FORMATS.items() if re.search(each.mark, text, re.M)]
         if not fits:
-            formats = "; ".join(entry.summary for entry in CALIBRATION_FORMATS.values())
+            expected = f"in a known format ({', '.join(CALIBRATION_FORMATS)})"
             cure = "Is this the right file? Otherwise give fx, fy, cx, cy and baseline, or K and E."
-            expected, got = f"in a known format ({formats})", f"{path}, which is none of them"
+            got = f"{path}, which is none of them"
             bad_value("calibration", expected, got, cure, UnknownFormatError)
         names.add(fits[0])
     if len(names) != 1:

@@ -29,7 +29,8 @@ LENS_MODELS = {
     **{"": "opencv", "cameratype 0": "opencv", "cameratype 1": "fisheye"},
     **dict.fromkeys("opencv pinhole simple_pinhole none brownconrady".split(), "opencv"),
     **dict.fromkeys("full_opencv simple_radial radial perspective".split(), "opencv"),
-    **dict.fromkeys("radtan radial-tangential plumb_bob rational_polynomial".split(), "opencv"),
+    **dict.fromkeys("radtan radial-tangential radial_tangential plumb_bob".split(), "opencv"),
+    **dict.fromkeys(("rational_polynomial",), "opencv"),
     **dict.fromkeys("fisheye opencv_fisheye equidistant kannalabrandt4 kannalabrandt8".split(), "fisheye"),
     **dict.fromkeys("simple_fisheye simple_radial_fisheye radial_fisheye".split(), "fisheye"),
 }
@@ -177,6 +178,9 @@ def two_cameras(
     choice: CameraChoice, available: Collection[int], default: tuple[int, int]
 ) -> tuple[int, int]:
     """``choice.cameras``, else the default, as two different ones of those that a file has."""
+    if len(available) == 1:
+        cure = "Give the stereo calibration, in which one camera's pose is given beside the other's."
+        bad_value("the file", "of two cameras", "one of one camera", cure)
     left, right = choice.cameras or default
     if left == right or not {left, right} <= set(available):
         have = ", ".join(map(str, sorted(available))) or "none"

@@ -143,10 +143,16 @@ def euroc_camera(sensor: Entries) -> Camera:
     return _pinhole(sensor, "distortion_coefficients")
 
 
+def body_from_camera(sensor: Entries) -> np.ndarray:
+    """``(4, 4)`` pose of a camera in the body's frame; Kimera and others write it as a plain list."""
+    pose = sensor["T_BS"]
+    return rigid(pose["data"] if isinstance(pose, dict) else pose, "T_BS")
+
+
 def read_euroc(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """The images as taken, left file first; ``T_BS`` is a camera's pose in the body's frame, in metres."""
     sensors = [read_yaml(text) for text in texts]
-    T_body_left, T_body_right = (rigid(sensor["T_BS"]["data"], "T_BS") for sensor in sensors)
+    T_body_left, T_body_right = map(body_from_camera, sensors)
     left, right = map(euroc_camera, sensors)
     return make_rig(left, right, np.linalg.inv(T_body_left) @ T_body_right)
 

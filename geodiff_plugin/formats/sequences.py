@@ -1,18 +1,31 @@
-"""Data sets of posed frames, and what has no poses: 7-Scenes, ScanNet, TUM RGB-D, videos, photographs."""
+"""Data sets of posed frames, and what has no poses: 7-Scenes, ScanNet, TUM RGB-D, videos, photographs.
+
+Source: ``src/utils/datasets.py`` of cvg/nice-slam; ``_info.txt`` of ScanNet's SensReader and 3RScan.
+"""
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from geodiff_plugin._checks import InputError
-from geodiff_plugin.formats.files import read_matrix, read_rows
-from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Layout, images_in, images_of
+from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin.formats.files import read_matrix, read_rows, read_text
+from geodiff_plugin.formats.layouts import (
+    Candidate,
+    CaptureFrame,
+    Layout,
+    build_frame,
+    images_in,
+    images_of,
+)
 from geodiff_plugin.formats.recordings import is_video, video_facts
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, reading_whole, rigid
 from geodiff_plugin.messages import Message
@@ -36,6 +49,12 @@ TRACKED = {
     "ScanNet": OnePoseAFile("color/*", "pose/{}.txt", "depth/{}.png"),
 }
 INTRINSICS = "intrinsics.txt camera-intrinsics.txt K.txt intrinsic/intrinsic_color.txt intrinsic_color.txt"
+#: Where ScanNet's and 12-Scenes' recorder, and 3RScan, write the cameras of their frames.
+INFOS = ("_info.txt", "info.txt")
+#: Its lines, ``name = value``.
+INFO = re.compile(r"(?m)^\s*(m_\w+)\s*=\s*(.*)$")
+#: Replica as NICE-SLAM rendered it: the file of its camera beside the scenes, or in one.
+REPLICA_CAMERA = "cam_params.json"
 #: Values a metre of TUM's depth maps.
 TUM_DEPTH = 5000.0
 #: Poses of a trajectory further from an image than this, in seconds, are not its own.
@@ -47,6 +66,10 @@ PoseAt = Callable[[float], np.ndarray | None]
 
 def _file_camera(folder: Path, published: Camera | None) -> Camera | None:
     """The intrinsics that a data set has as a file, else its published ones."""
+    infos = (parent / name for parent in (folder, folder.parent) for name in INFOS)
+    info = next((file for file in infos if file.is_file()), None)
+    if info is not None:
+        return _camera_of_info(info)
     files = [parent / name for parent in (folder, folder.parent) for name in INTRINSICS.split()]
     file = next((file for file in files if file.is_file()), None)
     return published if file is None else Camera(read_matrix(file, f"{file}")[:3, :3])
@@ -76,6 +99,39 @@ def read_tracked(folder: Path) -> Layout | None:
             candidates.append(Candidate(CaptureFrame(name, path, E, depth), camera))
         return Layout(kind, "m", candidates, notes=_assumed(kind, camera))
     return None
+
+
+def _camera_of_info(file: Path) -> Camera:
+    """The colour camera of an ``_info.txt``, whose matrix is written in 16 numbers."""
+    entries = dict(INFO.findall(read_text(file, f"{file}")))
+    with reading_whole(file, "_info.txt of ScanNet's recorder or 3RScan"):
+        K = array_of(entries["m_calibrationColorIntrinsic"].split(), (4, 4), "m_calibrationColorIntrinsic")
+        return Camera(K[:3, :3], (int(entries["m_colorWidth"]), int(entries["m_colorHeight"])))
+
+
+def read_replica(folder: Path) -> Layout | None:
+    """Replica as NICE-SLAM rendered it: ``results/frame*.jpg``, a pose a line in ``traj.txt``, in metres."""
+    images, file = images_of(folder.glob("results/frame*")), folder / "traj.txt"
+    if not (images and file.is_file()):
+        return None
+    params = next((at for at in (folder, folder.parent) if (at / REPLICA_CAMERA).is_file()), None)
+    camera, per_m = None, None
+    if params is not None:
+        with reading_whole(params / REPLICA_CAMERA, "cam_params.json of Replica", complete=True):
+            entries = json.loads(read_text(params / REPLICA_CAMERA, REPLICA_CAMERA))["camera"]
+            K = intrinsics(*(entries[key] for key in ("fx", "fy", "cx", "cy")))
+            camera, per_m = Camera(K, (entries["w"], entries["h"])), float(entries["scale"])
+    rows = read_rows(file, f"{file}", "poses, one a line")
+    if len(rows) < len(images):
+        bad_value(f"{file}", f"of {len(images)} lines, one for each image", f"{len(rows)}")
+
+    def build(frame: CaptureFrame, row: list[str]) -> Candidate:
+        depth = frame.image.with_name(f"{frame.name.replace('frame', 'depth')}.png")
+        return Candidate(replace(frame, E=rigid(row, "a pose"), depth=depth, depth_per_m=per_m), camera)
+
+    pairs = zip(images, rows, strict=False)  # NICE-SLAM leaves out what lies behind the last image
+    candidates = [build_frame(CaptureFrame(i.stem, i), partial(build, row=row)) for i, row in pairs]
+    return Layout("Replica", "m", candidates)
 
 
 def read_tum(folder: Path) -> Layout | None:

@@ -148,6 +148,29 @@ def _kitti_cameras(available: Collection[int], choice: CameraChoice) -> tuple[in
     return two_cameras(choice, have, pairs[-1])
 
 
+def read_vkitti(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """Virtual KITTI 2: K (``intrinsic.txt``) and pose (``extrinsic.txt``) of both cameras in every frame.
+
+    Poses are world-to-camera. The pair is rectified, so poses of another direction would not be parallel.
+    """
+    left_image = str(choice.image_names[0]) if choice.image_names else ""
+    digits = re.findall(r"\d+", PurePath(left_image.replace("\\", "/")).stem)
+    rows = [[line.split() for line in text.splitlines()[1:] if line.strip()] for text in texts]
+    rows.sort(key=lambda table: len(table[0]))  # the shorter lines are those of K
+    frame = str(int(digits[-1])) if digits else ""
+    K, T = ({row[1]: row[2:] for row in table if row[0] == frame} for table in rows)
+    if not (K.keys() & T.keys() >= {"0", "1"}):
+        numbers = [int(row[0]) for row in rows[0]]
+        expected = f"named by its frame, {min(numbers)} to {max(numbers)}, as rgb_00006.jpg"
+        bad_value("the left image", expected, left_image or "no name")
+    left, right = (Camera(intrinsics(*K[camera])) for camera in "01")
+    T_left, T_right = (rigid(T[camera], f"camera {camera} of frame {frame}") for camera in "01")
+    E = T_left @ np.linalg.inv(T_right)
+    if not np.allclose(E[:3, :3], np.eye(3), atol=1e-3) or E[0, 3] < 0.9 * np.linalg.norm(E[:3, 3]):
+        bad_value("extrinsic.txt", "world-to-camera poses of a rectified pair", f"{E[:3].round(3).tolist()}")
+    return make_rig(left, right, E, rectified=True)
+
+
 def _kitti_projections(text: str, choice: CameraChoice) -> list[tuple[np.ndarray, list[str] | None]]:
     """``(3, 4)`` projections of the left and the right camera, and the words of their sizes, if there."""
     rows = {key: words.split() for key, words in re.findall(r"(?m)^\s*(\w+)\s*:(.*)$", text)}

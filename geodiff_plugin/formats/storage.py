@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -31,6 +32,10 @@ from geodiff_plugin.types import Rig
 Entries = dict[str, Any]
 #: OpenCV's head of a YAML file, which YAML itself does not know; files written by hand copy it.
 OPENCV_HEAD = re.compile(r"\A\s*%YAML:[^\n]*")
+#: A list behind its name without a blank, which OpenCV reads, as in the settings of ORB-SLAM.
+TIGHT_LIST = re.compile(r"(?m)^(\s*[\w.]+:)\[")
+#: Entries may lie so many levels below each other.
+MOST_LEVELS = 8
 #: Dumps of programs that share a list have a few.
 MOST_ALIASES = 32
 #: Numbers that an array of an .npz may have: those of cameras have 16 at most, lists of lenses 14.
@@ -72,7 +77,8 @@ for _kind in ("opencv-matrix", "opencv-nd-matrix"):
 
 def read_yaml(text: str) -> Entries:
     """The mapping that the first YAML document holds; later documents (``rostopic echo``) are left out."""
-    content = next(yaml.load_all(OPENCV_HEAD.sub("", text), _Loader), None)  # noqa: S506  (a safe one)
+    text = TIGHT_LIST.sub(r"\1 [", OPENCV_HEAD.sub("", text))
+    content = next(yaml.load_all(text, _Loader), None)  # noqa: S506  (a safe one)
     if not isinstance(content, dict):
         bad_value("the file", "a YAML file of named entries", type(content).__name__)
     return content
@@ -82,19 +88,22 @@ def read_storage(text: str) -> Entries:
     """The entries of an OpenCV file by key in small letters: numbers as flat arrays, and strings."""
     # JSON is YAML; older versions of OpenCV write 1. and .Nan into it, which JSON itself does not know.
     content = _of_element(parse_xml(text)) if "<opencv_storage" in text else read_yaml(text)
-    maps = {key: value for key, value in content.items() if isinstance(value, dict) and "data" not in value}
-    below = [(_below(str(key), name), value) for key, each in maps.items() for name, value in each.items()]
     entries: Entries = {}
-    for key, value in [*below, *content.items()]:
+    for key, value in _flat(content, ""):
         numbers = _numbers(value["data"] if isinstance(value, dict) and "data" in value else value)
-        entries[str(key).lower()] = value if numbers is None else numbers
+        entries[key.lower()] = value if numbers is None else numbers
     return entries
 
 
-def _below(key: str, name: Any) -> str:
-    """The name of an entry below another, with the side of its camera where the outer name says one."""
-    sides = re.findall("left|right", key.lower())
-    return f"{sides[0]}.{name}" if len(sides) == 1 else str(name)
+def _flat(content: Entries, outer: str, level: int = 0) -> Iterator[tuple[str, Any]]:
+    """Names and entries, those below others first, with the side of a camera where an outer name says one."""
+    sides = set(re.findall("left|right", outer.lower()))
+    side = f"{sides.pop()}." if len(sides) == 1 else ""
+    for key, value in content.items():
+        if isinstance(value, dict) and "data" not in value and level < MOST_LEVELS:
+            yield from _flat(value, f"{outer}.{key}", level + 1)
+    for key, value in content.items():
+        yield f"{side}{key}", value
 
 
 def _of_element(node: ElementTree.Element) -> Any:
@@ -137,9 +146,15 @@ NAMES = {
     "image_size": "imagesize|imgres|imgsize|size",
     "image_width": "imagewidth|leftwidth",
     "image_height": "imageheight|leftheight",
+    "M": WORDS["M"],
+    "D": WORDS["D"],
+    "baseline": "baseline|baselinem|baselinemeters|baselinemetres",
 }
 #: Those that are one number; what else is a number, such as a coefficient ``k1``, is none of the matrices.
-NUMBERS = ("image_width", "image_height")
+NUMBERS = ("image_width", "image_height", "baseline")
+SIDES = ("image_width", "image_height")
+#: Those that two parallel cameras may share.
+FOR_BOTH = ("M", "D")
 Arrays = list[tuple[str, np.ndarray]]
 
 
@@ -149,7 +164,10 @@ def _named(arrays: Arrays) -> Entries:
     for name, words in NAMES.items():
         fits = [(key, v) for key, v in arrays if (v.size == 1) == (name in NUMBERS)]
         fits = [(key, v) for key, v in fits if re.fullmatch(words, re.sub("[_.]", "", key))]
-        if any(not np.array_equal(v, fits[0][1]) for _, v in fits[1:]):
+        differ = any(not np.array_equal(v, fits[0][1]) for _, v in fits[1:])
+        if differ and name in FOR_BOTH:
+            continue
+        if differ:
             cure = "Keep those that belong to R and T; files of single cameras have no baseline."
             bad_value(name, "there once", f"{', '.join(key for key, _ in fits)}, which differ", cure)
         if fits:
@@ -173,21 +191,36 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         item for text in texts for item in read_storage(text).items() if isinstance(item[1], np.ndarray)
     ]
     named = _named(arrays)
-    sides = np.array([named[name].item() for name in NUMBERS if name in named])
+    sides = np.array([named[name].item() for name in SIDES if name in named])
     size = next((pair for pair in (named.get("image_size", sides), sides) if pair.size == 2), None)
     if named.keys() >= {"P1", "P2"}:
         return projected(named["P1"], named["P2"], size, size)
     posed = "E" in named and named["E"].size == 16 and "R" not in named  # of 9 it is the essential matrix
+    if "baseline" in named and not posed and not named.keys() & {"R", "T"}:
+        return _parallel(named, arrays, size)
     missing = [name for name in ("M1", "M2", *(() if posed else ("R", "T"))) if name not in named]
     if missing:
         expected = "a calibration with P1, P2, or with M1, M2, R, T"
         cure = "Where intrinsics and extrinsics are two files, give both; rename what has other names."
+        one = "It is of one camera: give the stereo calibration, or K and E of the pair (--K, --E)."
+        cure = one if "M" in named and not named.keys() & {"M1", "M2"} else cure
         bad_value("the file", expected, f"no {', '.join(missing)}", cure)
     lenses = zip(("M1", "M2"), _lenses(arrays, named), strict=True)
     left, right = (Camera(named[name], size, lens) for name, lens in lenses)
     if posed:
         return make_rig(left, right, rigid(named["E"], "E"))
     return make_rig(left, right, np.linalg.inv(transform(named["R"], named["T"], "R, T")))
+
+
+def _parallel(named: Entries, arrays: Arrays, size: Any) -> Rig:
+    """Parallel cameras of one height, by their matrices, or one for both, and the baseline in metres."""
+    Ks = [named.get(name, named.get("M")) for name in ("M1", "M2")]
+    if any(K is None for K in Ks):
+        bad_value("the file", "a calibration with K1 and K2, or K, and a baseline", "no K1, K2")
+    one = named.get("D1", named.get("D", ()))
+    lenses = [one, one] if "M" in named else _lenses(arrays, named)
+    left, right = (Camera(K, size, lens) for K, lens in zip(Ks, lenses, strict=True))
+    return make_rig(left, right, named["baseline"].item())
 
 
 def text_of_npz(path: Path) -> str:

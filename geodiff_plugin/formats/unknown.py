@@ -43,13 +43,39 @@ FOREIGN = (
     ForeignFormat(("*.sfm",), "a reconstruction of Meshroom", "Run: aliceVision_exportColmap."),
     ForeignFormat(("*.mvs",), "a scene of OpenMVS", "Give the COLMAP model that it was made from."),
     ForeignFormat(("database.db",), "COLMAP's matches without a model", MAPPER),
+    ForeignFormat(
+        ("cameras_sphere.npz", "cameras.npz"),
+        "cameras of NeuS and IDR",
+        "Split world_mat @ scale_mat by cv2.decomposeProjectionMatrix and write transforms.json.",
+    ),
+    ForeignFormat(("*_annotations.jgz",), "annotations of CO3D", "Write a sequence as transforms.json."),
     ForeignFormat(("poses_bounds.npy",), "poses of LLFF", "Give the COLMAP model that they were made from."),
     ForeignFormat(("*.svo", "*.svo2"), "a recording of ZED", "Export it as a video with ZED_SVO_Editor."),
     ForeignFormat(("*.rcproj",), "a project of RealityCapture", "Export its registration as COLMAP."),
+    ForeignFormat(
+        ("rtabmap*.db",),
+        "a database of RTAB-Map",
+        "Export images and the poses of the camera (RGB-D SLAM format) by rtabmap-export.",
+    ),
+    ForeignFormat(("*.tfrecord",), "a recording of Waymo", "Write images and poses as transforms.json."),
+    ForeignFormat(("*.hdf5", "*.h5"), "arrays in HDF5", "Write images and poses as transforms.json."),
     ForeignFormat(("*.traj",), "a trajectory of ARKitScenes", "Write it as transforms.json."),
     ForeignFormat(("image_lcam_front",), "a folder of TartanAir V2", "Write its poses as transforms.json."),
     ForeignFormat(
         ("*.bag", "*.mcap", "*.db3"), "a bag of ROS", "Give it to geodiff depth, with --left and --right."
+    ),
+    ForeignFormat(
+        ("cfg_args",), "a result of 3D Gaussian splatting", "Give the project that it was trained on."
+    ),
+    ForeignFormat(
+        ("*.zip", "*.tar", "*.tgz", "*.tar.gz", "*.7z", "*.rar"),
+        "an archive",
+        "Unpack it and give its folder.",
+    ),
+    ForeignFormat(
+        ("*.ply", "*.splat", "*.spz", "*.obj", "*.glb", "*.usdz"),
+        "a model without its photographs",
+        "Give the photographs with their cameras.",
     ),
     ForeignFormat(("*.pkl", "*.pickle", "*.pt"), "pickled objects", "They are never loaded: save .npz."),
 )
@@ -97,10 +123,11 @@ def _nearest(folder: Path, formats: Sequence[CaptureFormat]) -> str:
         for each in formats:
             if all(any(below.glob(mark)) for mark in each.marks):
                 return f"{below.name}/ looks like {each.summary}: give that folder."
-    best, said = 0.0, ""
+    best, said = (0.0, 0), ""
     for each in formats:
         lacking = [mark for mark in each.marks if not any(folder.glob(mark))]
-        share = 1 - len(lacking) / len(each.marks)
-        if lacking and share > best:
-            best, said = share, f"Nearest is {each.summary}, which also has {', '.join(lacking)}."
+        files = sum("." in mark and mark not in lacking for mark in each.marks)  # say more than folders
+        score = 1 - len(lacking) / len(each.marks), files
+        if lacking and score > best:
+            best, said = score, f"Nearest is {each.summary}, which also has {', '.join(lacking)}."
     return said

@@ -56,8 +56,7 @@ LAYOUTS = ("parquet", "folders")
 #: The ways to give the scale of a capture.
 OF_SCALE = ("metres_per_unit", "known_length", "distance")
 #: Files of stereo cameras that hold both pictures, by suffix.
-FILES_OF_BOTH = (".mpo",)
-SPATIAL = "Of a spatial photograph write both pictures first, for example by heif-dec of libheif."
+FILES_OF_BOTH = (".mpo", ".heic", ".heif")
 #: Fields that hold paths, but not of files that are read beside the photographs.
 PHOTOGRAPHS_AND_OUT = ("left", "right", "view", "out")
 
@@ -273,8 +272,7 @@ class DepthOptions(SpeedOptions, RunOptions):
             refuse(f"--prior-map takes the place of a prior: leave out --prior {self.prior}.")
         if self.right is None and self.points is None and self.disparity is None:
             alone = "One photograph alone does not tell metres"
-            spatial = f" {SPATIAL}" if self.left.suffix.lower() in (".heic", ".heif") else ""
-            refuse(f"RIGHT is missing. {alone}: give a second view, or known depths by --points.{spatial}")
+            refuse(f"RIGHT is missing. {alone}: give a second view, or known depths by --points.")
         if self.side_by_side and not self.both_in_one:
             refuse("--side-by-side has both views in LEFT: leave out RIGHT, --points and --disparity.")
         if self.both_in_one and "colmap" in self.export:

@@ -26,7 +26,7 @@ from geodiff_plugin.formats.depth import depth_of_disparity, read_confidence, re
 from geodiff_plugin.formats.images import (
     intrinsics_from_exif,
     intrinsics_from_fov,
-    picture_count,
+    pages_of_both,
     warn_of_other_lens,
 )
 from geodiff_plugin.formats.lenses import (
@@ -190,15 +190,11 @@ def _read_both(options: DepthOptions, as_stored: bool) -> list[np.ndarray]:
     """Both views of the one file that LEFT names."""
     if options.side_by_side:
         return list(both_halves(_read_view(options.left, "LEFT", as_stored), "LEFT"))
-    count = picture_count(options.left, "LEFT")
-    if count != 2:
-        bad_value("LEFT", "an MPO file with two pictures, left one first", f"{count} in {options.left}")
-    left, right = (
-        _read_view(options.left, name, as_stored, page) for page, name in enumerate(("LEFT", "RIGHT"))
-    )
+    pages = zip(pages_of_both(options.left, "LEFT"), ("LEFT", "RIGHT"), strict=True)
+    left, right = (_read_view(options.left, name, as_stored, page) for page, name in pages)
     if left.shape != right.shape:
         sizes = " and ".join("{1}x{0}".format(*view.shape) for view in (left, right))
-        bad_value("LEFT", "an MPO file with two pictures of one size", f"{sizes} in {options.left}")
+        bad_value("LEFT", "a file with two pictures of one size", f"{sizes} in {options.left}")
     return [left, right]
 
 

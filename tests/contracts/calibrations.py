@@ -208,6 +208,17 @@ def sceneflow(rig: Drawn) -> tuple[str, ...]:
     return ("".join(f"Frame {n}\nL {words(poses[0])}\nR {words(poses[1])}\n\n" for n in (5, 6)),)
 
 
+def vkitti(rig: Drawn) -> tuple[str, ...]:
+    """intrinsic.txt and extrinsic.txt: a line for each camera in each frame, poses world-to-camera."""
+    K = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]\n"
+    T = "frame cameraID r1,1 r1,2 r1,3 t1 r2,1 r2,2 r2,3 t2 r3,1 r3,2 r3,3 t3 0 0 0 1\n"
+    for frame in range(3):
+        for n, pose in enumerate(rig.worlds):
+            K += f"{frame} {n} {words(rig.numbers(n))}\n"
+            T += f"{frame} {n} {words(pose)}\n"
+    return K, T
+
+
 def euroc(rig: Drawn) -> tuple[str, ...]:
     texts = []
     for n, T in enumerate(rig.worlds):
@@ -409,6 +420,7 @@ ANY_POSE = (
 RECTIFIED = (
     *(middlebury, middlebury_blanks, kitti_cam_to_cam, kitti_projections, booster, stereodemo, ros, ros_echo),
     opencv_projections,
+    vkitti,
 )
 ONE_CAMERA = (foundation_stereo, orb_slam_rectified, cityscapes, spring, sceneflow)
 
@@ -423,6 +435,7 @@ def choice(sample: str, baseline_m: float = 0.12) -> dict[str, Any]:
     """What ``read_calibration`` needs beside the text."""
     by_name = {"image_names": NAMES, "baseline_m": baseline_m}
     needed = {"zed": {"image_size": (1280, 720)}, "colmap": by_name, "nerf": by_name}
+    needed |= {"vkitti": {"image_names": ("Camera_0/rgb_00002.jpg", "Camera_1/rgb_00002.jpg")}}
     needed |= {"spring": {"baseline_m": baseline_m}}
     by_frame = tuple(f"35mm_focallength/fast/{side}/0006.png" for side in ("left", "right"))
     return (needed | {"sceneflow": by_name | {"image_names": by_frame}}).get(sample, {})

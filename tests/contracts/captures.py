@@ -241,7 +241,37 @@ def log(folder: Path) -> Twin:
     return Twin(folder, unit=None, typed=K, file="Barn_COLMAP_SfM.log")
 
 
+def replica(folder: Path) -> Twin:
+    """A scene of NICE-SLAM's Replica; the file of its camera lies beside the scenes."""
+    scene = folder / "room0"
+    pictures(scene / "results", [f"frame00000{i}.png" for i in range(4)])
+    depths(scene / "results", [f"depth00000{i}.png" for i in range(4)], 6553.5)
+    camera = {"w": SIZE[0], "h": SIZE[1], "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    (folder / "cam_params.json").write_text(json.dumps({"camera": camera | {"scale": 6553.5}}))
+    (scene / "traj.txt").write_text("".join(f"{words(E)}\n" for E in TRUE))
+    return Twin(scene, has_depth=True, file="traj.txt")
+
+
+def three_rscan(folder: Path) -> Twin:
+    """A sequence of 3RScan, or an older one of ScanNet, whose camera is that of ``_info.txt``."""
+    pictures(folder, [f"frame-00000{i}.color.png" for i in range(4)])
+    depths(folder, [f"frame-00000{i}.depth.png" for i in range(4)])
+    for i, E in enumerate(TRUE):
+        (folder / f"frame-00000{i}.pose.txt").write_text("\n".join(words(row) for row in E))
+    matrix = np.eye(4)
+    matrix[:3, :3] = K
+    info = f"m_versionNumber = 4\nm_sensorName = Tango\nm_colorWidth = {SIZE[0]}\nm_colorHeight = {SIZE[1]}\n"
+    info += "m_depthWidth = 224\nm_depthHeight = 172\nm_depthShift = 1000\n"
+    info += (
+        f"m_calibrationColorIntrinsic = {words(matrix)}\nm_calibrationColorExtrinsic = {words(np.eye(4))}\n"
+    )
+    (folder / "_info.txt").write_text(info + "m_frames.size = 4\n")
+    return Twin(folder, has_depth=True, file="_info.txt")
+
+
 WRITERS = (
+    replica,
+    three_rscan,
     *(polycam, record3d, stray, euroc, tartanair, kitti_odometry, mvsnet),
     *(metashape, opensfm, bundler, nvm, log),
 )

@@ -63,8 +63,9 @@ def test_a_rig_of_any_pose_is_read_as_it_was_written(tmp_path, write, drawn):
 @TAKE
 @given(drawn=rigs(turned=False))
 def test_a_rectified_rig_is_read_as_it_was_written(tmp_path, write, drawn):
-    rig = of.read_texts(tmp_path, *write(drawn), distorted=True)
-    check(rig, drawn, None if write in (of.kitti_projections, of.booster) else drawn.size)
+    rig = of.read_texts(tmp_path, *write(drawn), distorted=True, **choice(write.__name__))
+    without_size = (of.kitti_projections, of.booster, of.vkitti)
+    check(rig, drawn, None if write in without_size else drawn.size)
     assert rig.rectified == (write is not of.stereodemo) and rig.distortion == (None, None)
 
 
@@ -109,7 +110,7 @@ REFUSALS = [
     ("middlebury", "baseline=120.0\n", "", "no 'baseline'.*cut off"),
     ("middlebury", "baseline=120.0", "baseline=0", "baseline must be above 0"),
     ("middlebury", "200.0; 0.0 0.0 1.0]\ndoffs", "200.0; 0.0 0.0\ndoffs", "cam1 must be"),
-    ("kitti_projections", "P1:", "X1:", "two different cameras of the file .0.; got 0,0"),
+    ("kitti_projections", "P1:", "X1:", "the file must be of two cameras"),
     ("foundation_stereo", "0.12", "", "9 numbers of K and the baseline in metres; got 9 numbers.*--K"),
     ("stereodemo", '"fx": 700.0', '"fx": "a"', r"fx, fy, cx, cy must be 4 finite numbers; got \('a', 700"),
     ("stereodemo", "700.0", "9" * 5000, "must be a whole stereodemo JSON"),
@@ -252,6 +253,86 @@ def test_sockets_of_an_oak_may_have_names(tmp_path):
     data["cameraData"] = {letters[socket]: camera for socket, camera in data["cameraData"]}
     rig = of.read_texts(tmp_path, json.dumps(data))
     np.testing.assert_allclose(rig.E, of.read_texts(tmp_path, text).E)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"MATLAB 5.0 MAT-file, Platform: GLNXA64" + bytes(90), "jsonencode"),
+        (b"\x89HDF\r\n\x1a\n" + bytes(90), "jsonencode"),
+        (b"\x80\x04\x95" + bytes(20), "never loaded. In Python: np.savez"),
+        (b"\x93NUMPY\x01\0" + bytes(90), "Give it as --K or --E"),
+        (b"PIEH" + bytes(90), "MPI Sintel"),
+        (b"# oST version 5.0 parameters\n\n[image]\n", "Give left.yaml and right.yaml"),
+        (b"Calibration results\n===\nCamera-system parameters:\n cam0\n", "Give the camchain.yaml"),
+        (b'<?xml version="1.0"?>\n<calibration>\n  <projection>frame</projection>\n', "of one camera"),
+        (b"%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 752\n", "names both cameras"),
+        (b'{"camera_data_": [{"value": {"vehicle_SE3_camera_": {}}}]}', "Argoverse"),
+        (b'{"intrinsic_matrix": [1, 0, 0, 0, 1, 0, 5, 5, 1], "width": 9}', "Open3D"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
+        (b"<!DOCTYPE html>\n<html><body>404</body></html>\n", "a web page.*fetch it again"),
+    ],
+)
+def test_formats_that_are_not_read_are_named_with_what_to_give_instead(content, words, tmp_path):
+    (tmp_path / "calib.dat").write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        read_calibration(tmp_path / "calib.dat")
+
+
+def test_a_file_of_one_camera_says_so(tmp_path):
+    for text in ('{"K": [[700, 0, 320], [0, 700, 240], [0, 0, 1]], "dist": [0, 0, 0, 0, 0]}',):
+        with pytest.raises(InputError, match="It is of one camera: give the stereo calibration"):
+            of.read_texts(tmp_path, text)
+    chain = SAMPLES["kalibr"][0].partition("cam1:")[0]
+    with pytest.raises(InputError, match="of two cameras; got one of one camera"):
+        of.read_texts(tmp_path, chain)
+
+
+def test_lists_may_stand_tight_behind_their_names(tmp_path):
+    """As in the settings of ORB-SLAM2, which OpenCV reads."""
+    text = SAMPLES["opencv_projections"][0]
+    rig = of.read_texts(tmp_path, text.replace("data: [", "data:["))
+    np.testing.assert_array_equal(rig.E, of.read_texts(tmp_path, text).E)
+
+
+def test_matrices_may_lie_deep_below_the_names_of_sides(tmp_path):
+    camera = {"intrinsics": {"K": of.K.tolist()}, "lens": {"D": [0.0] * 5}}
+    entries = {
+        "rig": {"cameras": {"left": camera, "right": camera}, "R": np.eye(3).tolist(), "T": [-0.12, 0, 0]}
+    }
+    rig = of.read_texts(tmp_path, json.dumps(entries))
+    np.testing.assert_allclose(rig.E, np.linalg.inv(of.RIG.T))
+    np.testing.assert_array_equal(rig.K_right, of.K)
+
+
+@pytest.mark.parametrize("names", [("K_left", "K_right"), ("K",), ("camera_matrix",)])
+@pytest.mark.parametrize("baseline", ["baseline", "baseline_m"])
+def test_parallel_cameras_need_only_their_baseline(names, baseline, tmp_path):
+    K_right = of.K + [[0, 0, 7.0], [0, 0, 0], [0, 0, 0]]
+    matrices = dict(zip(names, (of.K.tolist(), K_right.tolist()), strict=False))
+    rig = of.read_texts(tmp_path, json.dumps(matrices | {baseline: 0.12}))
+    np.testing.assert_array_equal(rig.K_right, K_right if len(names) == 2 else of.K)
+    np.testing.assert_allclose(rig.E[:3, 3], [0.12, 0, 0])
+    lens = {"dist": [0.1, 0, 0, 0, 0]}
+    if len(names) == 1:
+        read = of.read_texts(tmp_path, json.dumps(matrices | lens | {baseline: 0.12}), distorted=True)
+        assert [each.coefficients[0] for each in read.distortion] == [0.1, 0.1]
+    with pytest.raises(InputError, match="baseline must be above 0"):
+        of.read_texts(tmp_path, json.dumps(matrices | {baseline: -0.12}))
+
+
+def test_virtual_kitti_is_read_by_frame_and_poses_of_another_direction_are_refused(tmp_path):
+    K, T = SAMPLES["vkitti"]
+    with pytest.raises(InputError, match="named by its frame, 0 to 2"):
+        of.read_texts(tmp_path, K, T, image_names=("rgb_00009.jpg", "rgb_00009.jpg"))
+    head, *lines = T.splitlines()
+    inverted = [head]
+    for line in lines:
+        frame, camera, *numbers = line.split()
+        pose = rigid([0.2, 0.4, -0.1], [0, 0, 0]) if camera == "0" else rigid([0.2, 0.4, -0.1], [0.12, 0, 0])
+        inverted.append(f"{frame} {camera} {of.words(pose)}")
+    with pytest.raises(InputError, match="world-to-camera poses of a rectified pair"):
+        of.read_texts(tmp_path, K, "\n".join(inverted), **choice("vkitti"))
 
 
 BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(

@@ -371,6 +371,8 @@ HOSTILE = {
 )
 @pytest.mark.parametrize("name", HOSTILE.values(), ids=HOSTILE)
 def test_a_hostile_name_in_a_file_of_cameras_leaves_out_its_frame_alone(write, name, tmp_path, capsys):
+    if write is hostile_binary and "\0" in name:
+        pytest.skip("there a zero ends the name")
     write(tmp_path, name)
     capture = Capture.open(tmp_path)
     assert capture.names == ["f00", "f02", "f03"]

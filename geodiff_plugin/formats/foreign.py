@@ -1,0 +1,65 @@
+"""Calibrations of formats that are known and not read: what each is, and what to give instead."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from geodiff_plugin._checks import bad_value
+
+#: Bytes by which a file is recognised.
+HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class ForeignCalibration:
+    """A format that is not read: what its files begin with or hold early, what it is, and the cure."""
+
+    mark: str
+    name: str
+    cure: str
+
+
+ONE_CAMERA = "It is of one camera: give the stereo calibration, or K and E of the pair (--K, --K-right, --E)."
+SAVE_NPZ = "In Python: np.savez('calib.npz', K1=K1, D1=D1, K2=K2, D2=D2, R=R, T=T) of its matrices."
+FOREIGN_CALIBRATIONS = (
+    ForeignCalibration(
+        r"\AMATLAB 5\.0 MAT-file|\A\x89HDF",
+        "a .mat of MATLAB (or HDF5)",
+        "In MATLAB: writelines(jsonencode(toStruct(stereoParams)), 'stereo.json').",
+    ),
+    ForeignCalibration(r"\A\x80[\x02-\x05]", "pickled objects, which are never loaded", SAVE_NPZ),
+    ForeignCalibration(r"\A\x93NUMPY", "a single array", f"Give it as --K or --E. {SAVE_NPZ}"),
+    ForeignCalibration(r"\APIEH", "a .cam of MPI Sintel", f"Read it by its sintel_io.py. {ONE_CAMERA}"),
+    ForeignCalibration(
+        r"\A# oST version",
+        "an .ini of ROS' camera_calibration",
+        "Give left.yaml and right.yaml, which lie in the same calibrationdata.tar.gz.",
+    ),
+    ForeignCalibration(
+        r"^\s*(Camera-system parameters|Calibration results)\s*:?\s*$",
+        "Kalibr's results as text",
+        "Give the camchain.yaml of the same run.",
+    ),
+    ForeignCalibration(r"<calibration>\s*<projection>", "a lens of Metashape (XML)", ONE_CAMERA),
+    ForeignCalibration(
+        r"\A(?=[\s\S]*^model_type\s*:)(?![\s\S]*^cam0_calib\s*:)",
+        "a camera of VINS-Fusion",
+        "Give the configuration that names both cameras (cam0_calib, cam1_calib).",
+    ),
+    ForeignCalibration(r'"vehicle_SE3_camera_"', "a calibration of Argoverse", ONE_CAMERA),
+    ForeignCalibration(r'\A\s*\{(?=[\s\S]*"intrinsic_matrix")', "a camera of Open3D", ONE_CAMERA),
+)
+
+
+def refuse_foreign_calibration(file: Path) -> None:
+    """Refuse a file of a format that is known and not read."""
+    if not os.path.isfile(file) or not os.access(file, os.R_OK):
+        return  # what is wrong is said where it is read
+    with file.open("rb") as opened:
+        head = opened.read(HEAD_BYTES).decode("latin-1")
+    for each in FOREIGN_CALIBRATIONS:
+        if re.search(each.mark, head, re.MULTILINE):
+            bad_value("calibration", "in a format that is read", f"{file}, {each.name}", each.cure)
