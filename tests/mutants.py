@@ -460,6 +460,61 @@ MUTANTS = [
         tests=CAPTURES,
     ),
     *of("formats/transforms.py", ("pose[:3, 3] /= check", "pose[:3, 3] *= check"), tests=CAPTURES),
+    *of(
+        "formats/lidar.py",
+        ("+ T[:3, 3] + place", "+ T[:3, 3] - place"),
+        ("transform(R, (0, 0, 0), rectifying) @ T", "T"),
+        ("seen[seen[:, 2] > 0]", "seen"),
+        ("rows[:, 3].max() > 1", "rows[:, 3].max() > 255"),
+        tests=(f"{UNIT}lidar.py",),
+    ),
+    *of(
+        "formats/stereo.py",
+        ("np.linalg.inv(E_left) @ E_right", "np.linalg.inv(E_right) @ E_left"),
+        ('"15mm": 450.0', '"15mm": 1050.0'),
+        ("E = T_left @ np.linalg.inv(T_right)", "E = np.linalg.inv(T_left) @ T_right"),
+        ("E[0, 3] < 0.9", "E[0, 3] < -0.9"),
+        tests=("tests/contracts/test_formats.py",),
+    ),
+    *of(
+        "formats/storage.py",
+        ('one = named.get("D1", named.get("D", ()))', 'one = named.get("D1", ())'),
+        ("if differ and name in FOR_BOTH", "if False and name in FOR_BOTH"),
+        ("level < MOST_LEVELS", "level < 1"),
+        ('side = f"{sides.pop()}."', 'side = f"{sides}."'),
+        tests=("tests/contracts/test_formats.py",),
+    ),
+    *of(
+        "formats/sequences.py",
+        ("Camera(K[:3, :3], (int(entries", "Camera(K[:3, :3].T, (int(entries"),
+        ('float(entries["scale"])', "None"),
+        (
+            'E=rigid(row, "a pose"), depth=depth, depth_per_m',
+            'E=np.linalg.inv(rigid(row, "a pose")), depth=depth, depth_per_m',
+        ),
+        tests=("tests/contracts/test_captures.py",),
+    ),
+    *of(
+        "formats/images.py",
+        ("return int(pair[0]), int(pair[1])", "return int(pair[1]), int(pair[0])"),
+        ('group["type"] == STEREO_GROUP', "group"),
+        tests=(f"{UNIT}spatial_heic.py",),
+    ),
+    *of(
+        "formats/foxglove.py",
+        ("1_000_000_000 + int(message.timestamp.nanos)", "1_000_000_000 - int(message.timestamp.nanos)"),
+        ("starting_at=start, ending_before=stop", "starting_at=stop, ending_before=start"),
+        tests=(f"{UNIT}foxglove.py",),
+    ),
+    *of(
+        "jobs/lengths.py",
+        ("KnownScale(length / measured", "KnownScale(measured / length"),
+        ("if relative > MOST_SPREAD", "if relative < MOST_SPREAD"),
+        ("math.hypot(spread, length * scale_spread)", "spread"),
+        ("ends = taken if frame.lens is None", "ends = taken if True"),
+        ("span.frame not in doubted", "span.frame in doubted"),
+        tests=(f"{UNIT}capture.py",),
+    ),
 ]
 
 

@@ -49,6 +49,16 @@ FOREIGN_CALIBRATIONS = (
         "a camera of VINS-Fusion",
         "Give the configuration that names both cameras (cam0_calib, cam1_calib).",
     ),
+    ForeignCalibration(
+        r"^Device info\s*:",
+        "a RealSense without its calibration",
+        "Give what rs-enumerate-devices -c prints.",
+    ),
+    ForeignCalibration(
+        r"\A# Bundle file|\ANVM_V3|<document[^>]*>\s*<chunk|\A\s*\[\s*\{[\s\S]*\"(shots|cameras)\"",
+        "a reconstruction of many images",
+        "Give it to geodiff capture.",
+    ),
     ForeignCalibration(r'"vehicle_SE3_camera_"', "a calibration of Argoverse", ONE_CAMERA),
     ForeignCalibration(r'\A\s*\{(?=[\s\S]*"intrinsic_matrix")', "a camera of Open3D", ONE_CAMERA),
 )

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -267,6 +268,10 @@ def test_sockets_of_an_oak_may_have_names(tmp_path):
         (b"Calibration results\n===\nCamera-system parameters:\n cam0\n", "Give the camchain.yaml"),
         (b'<?xml version="1.0"?>\n<calibration>\n  <projection>frame</projection>\n', "of one camera"),
         (b"%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 752\n", "names both cameras"),
+        (b"Device info: \n    Name : \tIntel RealSense D435\n", "rs-enumerate-devices -c"),
+        (b"# Bundle file v0.3\n2 0\n", "geodiff capture"),
+        (b'<?xml version="1.0"?>\n<document version="2.0.0">\n<chunk label="1">', "geodiff capture"),
+        (b'[{"cameras": {}, "shots": {}}]', "geodiff capture"),
         (b'{"camera_data_": [{"value": {"vehicle_SE3_camera_": {}}}]}', "Argoverse"),
         (b'{"intrinsic_matrix": [1, 0, 0, 0, 1, 0, 5, 5, 1], "width": 9}', "Open3D"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
@@ -319,6 +324,16 @@ def test_parallel_cameras_need_only_their_baseline(names, baseline, tmp_path):
         assert [each.coefficients[0] for each in read.distortion] == [0.1, 0.1]
     with pytest.raises(InputError, match="baseline must be above 0"):
         of.read_texts(tmp_path, json.dumps(matrices | {baseline: -0.12}))
+
+
+def test_a_pose_of_a_sensor_may_be_a_plain_list(tmp_path):
+    """As in Kimera's files."""
+    texts = []
+    for text in SAMPLES["euroc"]:
+        sensor = yaml.safe_load(text)
+        sensor |= {"T_BS": sensor["T_BS"]["data"], "distortion_model": "radial_tangential"}
+        texts.append("%YAML:1.0\n" + yaml.safe_dump(sensor))
+    np.testing.assert_allclose(of.read_texts(tmp_path, *texts).E, np.linalg.inv(of.RIG.T))
 
 
 def test_virtual_kitti_is_read_by_frame_and_poses_of_another_direction_are_refused(tmp_path):

@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.formats import read_lidar, read_points
+from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.jobs.reading import read_pair
 from tests.fuzz.test_fuzz import EXAMPLES, damaged, survives
 
 RNG = np.random.default_rng(0)
@@ -117,3 +120,18 @@ def test_damaged_files_of_a_lidar_get_a_sentence(file, tmp_path):
         survives(lambda: read_lidar(tmp_path / "scan.bin", [calib], (2, 3)))
 
     check()
+
+
+def test_the_command_takes_a_scan_beside_its_calibration(tmp_path):
+    SCAN.tofile(tmp_path / "scan.bin")
+    calib = raw(tmp_path)
+    for camera in ("image_02", "image_03"):
+        (tmp_path / camera).mkdir()
+        picture = np.random.default_rng(0).integers(0, 255, (375, 1242, 3), dtype=np.uint8)
+        Image.fromarray(picture).save(tmp_path / camera / "7.png")
+    views = {"left": tmp_path / "image_02/7.png", "right": tmp_path / "image_03/7.png", "calib": (calib,)}
+    pair = read_pair(DepthOptions(**views, points=tmp_path / "scan.bin"))
+    points = np.asarray(pair.guidance.inputs[0].points)
+    np.testing.assert_allclose(points, read_lidar(tmp_path / "scan.bin", [calib], (2, 3)), rtol=1e-5)
+    with pytest.raises(InputError, match="--points-scale must be left out"):
+        read_pair(DepthOptions(**views, points=tmp_path / "scan.bin", points_scale=1000.0))
