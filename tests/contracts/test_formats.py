@@ -99,7 +99,7 @@ def test_a_cut_off_file_is_a_sentence_that_names_it_or_a_whole_rig(sample, tmp_p
         try:
             rig = of.read_texts(tmp_path, *others, last[:cut], **choice(sample))
         except ValueError as error:
-            assert type(error) is InputError and re.search(r"must be .*; got .*", str(error), re.DOTALL)
+            assert isinstance(error, InputError) and re.search(r"must be .*; got .*", str(error), re.DOTALL)
             refused += 1
         else:
             assert np.isfinite(rig.E).all() and rig.K_right[0, 0] > 0
