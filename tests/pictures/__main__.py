@@ -3,6 +3,7 @@
 python -m tests.pictures rooms --data FOLDER
 python -m tests.pictures mistaken
 python -m tests.pictures charts
+python -m tests.pictures notebook
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from tests.pictures.charts import write_charts
 from tests.pictures.gallery import write_rendered, write_room, write_slider, write_tiles
 from tests.pictures.mistaken import write_mistaken
 from tests.pictures.moving import write_moving
+from tests.pictures.notebook import write_notebook
 from tests.pictures.rooms import ROOMS, room_named, solve
 
 IMAGES = Path("docs/images")
@@ -65,6 +67,14 @@ def charts(
 ) -> None:
     """A bar chart above every table of results, made from the table."""
     write_charts(pages, images)
+
+
+@app.command()
+def notebook(
+    path: Annotated[Path, typer.Option(help="The notebook.")] = Path("examples/quickstart.ipynb"),
+) -> None:
+    """The outputs of the notebook, which is run as it stands."""
+    write_notebook(path)
 
 
 @app.command()
