@@ -170,7 +170,7 @@ CSS = """
 .picture { display: block; margin: 0 auto; max-width: 100%; max-height: 60vh; border-radius: 6px; }
 .headline { padding: 0.1rem 0 0.4rem; }
 .headline .hint { color: var(--body-text-color-subdued); }
-.viewer-stage { position: relative; height: min(50vh, 560px); border-radius: 8px; overflow: hidden; }
+.viewer-stage { position: relative; height: clamp(300px, 50vh, 560px); border-radius: 8px; overflow: hidden; }
 .viewer canvas { width: 100%; height: 100%; display: block; touch-action: pan-y; background: #171a1f; }
 .viewer svg { position: absolute; inset: 0; width: 100%; height: 100%; pointer-events: none; }
 .viewer svg line { stroke: white; stroke-width: 2; filter: drop-shadow(0 0 2px black); }
