@@ -127,13 +127,11 @@ def rasterised(figure: Any) -> Image.Image:
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
 
-def _sheet(picture: np.ndarray) -> Any:
-    """A matplotlib figure that shows a picture ``(H, W, 3)`` of uint8 pixel by pixel."""
+def _sheet(width: int, height: int) -> Any:
+    """A white matplotlib figure of so many pixels, for what stands beside pictures."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(picture.shape[1] / DPI, picture.shape[0] / DPI), dpi=DPI)
-    figure.figimage(picture, zorder=-1)  # below the axes
-    return figure
+    return Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
 
 
 def _figure(picture: np.ndarray, colours: str, label: str, marks: Sequence[tuple[float, str]]) -> Image.Image:
@@ -143,11 +141,10 @@ def _figure(picture: np.ndarray, colours: str, label: str, marks: Sequence[tuple
     picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
     high, size = len(picture), max(12, len(picture) // 26)
     gap, bar = size // 2, max(14, high // 24)
-    sheet = np.pad(picture, ((0, 0), (0, gap + bar + 5 * size), (0, 0)), constant_values=255)
-    wide, letters = sheet.shape[1], {"fontsize": size * POINTS_PER_PIXEL}
-    x, thick = (picture.shape[1] + gap) / wide, bar / wide
+    wide, letters = gap + bar + 5 * size, {"fontsize": size * POINTS_PER_PIXEL}
+    x, thick = gap / wide, bar / wide
 
-    figure, low = _sheet(sheet), size * (3 if unknown else 1)
+    figure, low = _sheet(wide, high), size * (3 if unknown else 1)
     axes = figure.add_axes((x, low / high, thick, (high - 2 * size - low) / high))
     ramp = np.linspace(0, 1, 512)[:, None]
     axes.imshow(ramp, cmap=colours, aspect="auto", origin="lower", extent=(0, 1, 0, 1))
@@ -160,7 +157,7 @@ def _figure(picture: np.ndarray, colours: str, label: str, marks: Sequence[tuple
         key = figure.add_axes((x, size / high, thick, size / high), facecolor=str(GREY / 255))
         key.set(xticks=[], yticks=[])
         figure.text(x + thick + size / 2 / wide, 1.5 * size / high, "none", va="center", **letters)
-    return rasterised(figure)
+    return Image.fromarray(np.hstack([picture, np.asarray(rasterised(figure))]))
 
 
 def depth_figure(
@@ -206,18 +203,19 @@ def grid(
     cells = [p.resize((cell_width, max(1, round(p.height * cell_width / p.width)))) for p in pictures]
     rows = [cells[start : start + columns] for start in range(0, len(cells), columns)]
     heights = [head + gap + max(cell.height for cell in row) for row in rows]
-    wide, high = gap + columns * (cell_width + gap), gap + sum(heights)
-    sheet, places = Image.new("RGB", (wide, high), "white"), []
-    for k, cell in enumerate(cells):
-        places.append((gap + k % columns * (cell_width + gap), gap + sum(heights[: k // columns])))
-        sheet.paste(cell, (places[-1][0], places[-1][1] + head))
-
-    figure = _sheet(np.asarray(sheet))
-    for title, (left, top) in zip(titles, places, strict=True):
-        size = min(15, 1.7 * cell_width / max(1, len(title))) * POINTS_PER_PIXEL  # smaller if too long
-        x, y = (left + cell_width / 2) / wide, 1 - (top + head / 2) / high
-        figure.text(x, y, title, fontsize=size, parse_math=False, ha="center", va="center")
-    return rasterised(figure)
+    wide, top = gap + columns * (cell_width + gap), gap
+    sheet, named = Image.new("RGB", (wide, gap + sum(heights)), "white"), iter(titles)
+    for row, height in zip(rows, heights, strict=True):
+        figure = _sheet(wide, head)
+        for k, (cell, title) in enumerate(zip(row, named, strict=False)):
+            left = gap + k * (cell_width + gap)
+            sheet.paste(cell, (left, top + head))
+            size = min(15, 1.7 * cell_width / max(1, len(title))) * POINTS_PER_PIXEL  # smaller if too long
+            x = (left + cell_width / 2) / wide
+            figure.text(x, 0.5, title, fontsize=size, parse_math=False, ha="center", va="center")
+        sheet.paste(rasterised(figure), (0, top))
+        top += height
+    return sheet
 
 
 def overview(
