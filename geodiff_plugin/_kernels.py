@@ -13,10 +13,13 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from pathlib import Path
 from typing import Any
 
 import torch
 
+#: A kernel that every guided call with a second view launches, by its name in Triton's cache.
+ALWAYS_LAUNCHED = "paths_kernel"
 _switched_on: ContextVar[bool] = ContextVar("geodiff_kernels", default=True)
 
 
@@ -56,6 +59,22 @@ def kernels_in_use() -> str:
     if not torch.cuda.is_available() or torch.version.hip is not None:
         return "plain torch: kernels need CUDA"
     return "Triton on CUDA, compiled at the first call on a machine"
+
+
+def compilation_ahead(device: torch.device) -> str | None:
+    """A sentence for who waits, where the first guided call on a device compiles kernels; else ``None``.
+
+    That is where Triton's cache has none of them yet. It keeps them in ``TRITON_CACHE_DIR``, by default
+    ``~/.triton/cache``, for each kind of card and version of Triton.
+    """
+    on_cuda = device.type == "cuda" and torch.version.hip is None
+    if not on_cuda or not _switched_on.get() or not has_triton():
+        return None
+    home = Path(os.environ.get("TRITON_HOME") or Path.home())
+    cache = Path(os.environ.get("TRITON_CACHE_DIR") or home / ".triton" / "cache")
+    if any(cache.glob(f"*/{ALWAYS_LAUNCHED}.cubin")):
+        return None
+    return "The first guided call compiles its Triton kernels, which takes some seconds; Triton keeps them."
 
 
 def launched_on(tensor: torch.Tensor, launch: Callable[..., Any]) -> Callable[..., Any]:

@@ -31,7 +31,7 @@ from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Record, Shard, sh
 from geodiff_plugin.jobs.lengths import KnownScale, check_lengths, known_scale, measure, spans_to_measure
 from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import OF_SCALE, CaptureOptions
-from geodiff_plugin.jobs.prior import graphs_for_many, load_quiet_prior
+from geodiff_plugin.jobs.prior import graphs_for_many, load_quiet_prior, tell_of_compilation
 from geodiff_plugin.jobs.provenance import RECORD, SUMMARY, Provenance, begin_frames, check_poses
 from geodiff_plugin.jobs.report import messages_of, plain, read_report, single_map, verdict_report
 from geodiff_plugin.jobs.runner import Runner
@@ -367,12 +367,10 @@ def _depth_of_frames(
         begin_frames(made_from, options.out, names, options.overwrite)
     scale = solved_poses(capture, options, poses_key)
     seconds = {"poses": progress.seconds()}
-    solved = capture.solve()
-    progress.tell(f"poses {solved.status}: matches lie {solved.residual_px:.2f} px off their epipolar lines")
-    for note in (*solved.notes, *([scale.doubt] if scale and scale.doubt else ())):
-        warn(note)
+    _tell_of_poses(capture, scale, progress.tell)
     if options.poses_only:
         return {"unit": capture.unit, "poses": _pose_report(capture)} | _outcome([])
+    tell_of_compilation(options, pick_device(options.device), progress.tell)
     frames = _run_frames(capture, options, names, RunKeys(poses_key, key, scale), progress.bar)
     outcome = _outcome(frames)
     if not Shard.of(options.shard).whole:
@@ -397,11 +395,19 @@ def _depth_of_frames(
         "agreement": agreement,
         "measured": _measured(capture, options, outcome, scale),
         "notes": capture.notes,
-        "messages": as_records(capture.notes, solved.notes),
+        "messages": as_records(capture.notes, capture.solve().notes),
         **outcome,
     }
     write_text(options.out / SUMMARY, json.dumps(report, indent=2) + "\n")
     return report
+
+
+def _tell_of_poses(capture: Capture, scale: KnownScale | None, tell: Tell) -> None:
+    """A line on how the poses fit, and warnings on them and on their scale."""
+    solved = capture.solve()
+    tell(f"poses {solved.status}: matches lie {solved.residual_px:.2f} px off their epipolar lines")
+    for note in (*solved.notes, *([scale.doubt] if scale and scale.doubt else ())):
+        warn(note)
 
 
 def _measured(

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin._kernels import compilation_ahead, without_kernels
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.telling import Tell
 from geodiff_plugin.options import SpeedOptions
@@ -76,7 +77,16 @@ def graphs_for_many(options: SpeedOptions, device: torch.device) -> bool:
     return options.graphs or device.type == "cuda"
 
 
+def tell_of_compilation(options: SpeedOptions, device: torch.device, tell: Tell) -> None:
+    """Tell a line where the first picture of a job waits for kernels to be compiled."""
+    with without_kernels(options.no_kernels):
+        if line := compilation_ahead(device):
+            tell(line)
+
+
 def prior_of_options(options: DepthOptions, device: torch.device, tell: Tell | None = None) -> Any:
     """``load_guided_prior`` as the options say."""
     pipe = load_quiet_prior(options.prior, device, options.space, options.dtype, options.option, tell)
+    if tell is not None:
+        tell_of_compilation(options, device, tell)
     return enable_geometry_guidance(pipe, graphs=options.graphs, kernels=not options.no_kernels)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
+import logging
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, noted, refuse, warn
-from geodiff_plugin._kernels import without_kernels
+from geodiff_plugin._kernels import compilation_ahead, without_kernels
 from geodiff_plugin._threads import Beside
 from geodiff_plugin.algorithm.prompt import depth_prompt
 from geodiff_plugin.algorithm.schedule import count_steps
@@ -129,6 +130,8 @@ class GuidedCall(_Stock):
         if prior.deterministic and call["ensemble_size"] > 1:
             call |= _one_member(call)
         device = self._execution_device
+        if line := compilation_ahead(device):
+            logging.getLogger(__name__).info(line)
         lefts_01 = lefts_01.to(device)
         # Channels last, as the stock call reads pictures; with given latents Marigold does not accept it.
         layout = torch.channels_last if call["latents"] is None else torch.contiguous_format
