@@ -98,11 +98,6 @@ class PlaneRays(NamedTuple):
     centre: Tensor  # (B, 3, 1)
 
 
-def constant_like(like: Tensor, *values: float) -> Tensor:
-    """A vector of ``like``'s dtype made on its device: a list would be copied to the device at every call."""
-    return torch.stack([like.new_full((), value) for value in values])
-
-
 def to_device_of(like: Tensor, matrix: Tensor | np.ndarray) -> Tensor:
     """A camera matrix, or positions made of cameras, on the device of ``like``, in its own dtype.
 
@@ -111,6 +106,11 @@ def to_device_of(like: Tensor, matrix: Tensor | np.ndarray) -> Tensor:
     """
     given = torch.from_numpy(np.ascontiguousarray(matrix)) if isinstance(matrix, np.ndarray) else matrix
     return given.to(like.device, non_blocking=True)
+
+
+def constant_like(like: Tensor, *values: float) -> Tensor:
+    """A vector of ``like``'s dtype on its device: one copy, where values filled in there are a launch each."""
+    return to_device_of(like, torch.tensor(values, dtype=like.dtype, device="cpu"))
 
 
 def unproject(depth_m: Tensor, K: Tensor) -> Tensor:
