@@ -109,7 +109,7 @@ def to_device_of(like: Tensor, matrix: Tensor | np.ndarray) -> Tensor:
 
 
 def constant_like(like: Tensor, *values: float) -> Tensor:
-    """A vector of ``like``'s dtype on its device: one copy, where values filled in there are a launch each."""
+    """A vector of ``like``'s dtype on its device, by one copy: filling values in there is a launch each."""
     return to_device_of(like, torch.tensor(values, dtype=like.dtype, device="cpu"))
 
 
