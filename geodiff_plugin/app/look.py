@@ -244,7 +244,7 @@ footer { opacity: 0.8; }
   .figures span { font-size: 0.66rem; }
   .tab-container button { font-size: 0.82rem; padding: 0 0.45rem !important; }
   .headline { font-size: 0.85rem; min-height: 3.6rem; padding: 0 0 0.2rem; }  /* taps do not move the view */
-  #left label svg, #right label svg { display: none; }
+  #left label span, #right label span { display: none; }
   #left label, #right label { font-size: 0.72rem; padding-inline: 0.3rem; }
   .distance { font-size: 1.3rem; }
 }

@@ -15,6 +15,10 @@ FLAGS += ["--disable-background-networking", "--disable-component-update"]
 FLAGS += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # WebGL without a GPU, for the cloud
 
 
+#: A window that is no wider is touched.
+PHONE_PX = 390
+
+
 @pytest.fixture(scope="session")
 def chromium():
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -49,7 +53,9 @@ def visitor(chromium, address):
     def come(height: int = 1000, width: int = 1400):
         size = {"width": width, "height": height}
         # Without the slow turn at first, which a software renderer would spend its time on.
-        context = chromium.new_context(viewport=size, accept_downloads=True, reduced_motion="reduce")
+        context = chromium.new_context(
+            viewport=size, accept_downloads=True, reduced_motion="reduce", has_touch=width <= PHONE_PX
+        )
         contexts.append(context)
         context.set_default_timeout(60_000)  # of a machine that does other things as well
         page = context.new_page()

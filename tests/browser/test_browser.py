@@ -117,8 +117,9 @@ def test_it_opens_with_a_result_that_can_be_measured_and_an_example_runs_at_one_
     page.locator(".viewer canvas").scroll_into_view_if_needed()
     box = page.locator(".viewer canvas").bounding_box()
     for x, y in ((0.45, 0.5), (0.6, 0.55)):
-        page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        page.touchscreen.tap(box["x"] + x * box["width"], box["y"] + y * box["height"])
         page.wait_for_timeout(800)
+    assert page.locator(".viewer canvas").bounding_box() == box, "a tap does not move what is tapped next"
     page.wait_for_function(
         f"() => {{ const said = document.querySelector('#headline .distance'); "
         f"return said && said.innerText !== {before!r}; }}"
@@ -185,6 +186,17 @@ def test_the_focus_is_seen_wherever_the_keyboard_leads(visitor, scheme):
         seen.append(name)
         assert outline >= 2, f"the focus on {name} is not seen"
     assert any("Estimate depth" in name for name in seen) and any("canvas" in name for name in seen)
+
+
+def test_a_calibration_of_no_known_format_leads_to_those_that_can_be_read(visitor, plane_files, tmp_path):
+    (tmp_path / "notes.txt").write_text("no calibration")
+    page = visitor()
+    upload(page, [*plane_files()[:2], tmp_path / "notes.txt"])
+    page.click("#run")
+    link = page.wait_for_selector("#status .say-bad a", timeout=RUN_MS)
+    assert not page.locator("#readable-formats").is_visible()
+    link.click()
+    page.wait_for_selector("#readable-formats >> text=OAK-D JSON")
 
 
 def test_two_taps_give_the_ends_of_a_known_length(visitor, plane_files):
