@@ -74,7 +74,7 @@ def _write_comparison(
     try:
         with atomic_path(folder / COMPARISON) as temporary:
             sheet = grid(pictures, titles, columns=columns, cell_width=CELL_WIDTH)
-            sheet.save(temporary, optimize=True)
+            sheet.save(temporary)
     except OSError as error:  # the results themselves are safe
         say(f"geodiff: {COMPARISON} could not be written ({error.strerror or error}).")
 
