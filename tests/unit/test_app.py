@@ -9,6 +9,7 @@ import threading
 import time
 import zlib
 from base64 import b64decode
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from zipfile import ZipFile
 
@@ -333,7 +334,8 @@ def test_every_answer_has_the_headers_of_a_page_that_nobody_frames():
         sent.append(message)
 
     scope = {"type": "http", "headers": [(b"host", b"localhost")], "server": ("127.0.0.1", 1)}
-    asyncio.run(launch._Guard(page)(scope, None, send))
+    with ThreadPoolExecutor() as pool:  # tests in a browser leave a loop running in this thread
+        pool.submit(asyncio.run, launch._Guard(page)(scope, None, send)).result()
     headers = dict(sent[0]["headers"])
     assert b"frame-ancestors 'self'" in headers[b"content-security-policy"]
     assert headers[b"x-content-type-options"] == b"nosniff" and b"referrer-policy" in headers
