@@ -89,21 +89,30 @@ def read_storage(text: str) -> Entries:
     # JSON is YAML; older versions of OpenCV write 1. and .Nan into it, which JSON itself does not know.
     content = _of_element(parse_xml(text)) if "<opencv_storage" in text else read_yaml(text)
     entries: Entries = {}
-    for key, value in _flat(content, ""):
-        numbers = _numbers(value["data"] if isinstance(value, dict) and "data" in value else value)
-        entries[key.lower()] = value if numbers is None else numbers
-    return entries
+    unclear = set[str]()  # names that entries of several parts have, and none of them is the file's own
+    for key, value, level in _flat(content, ""):
+        key, numbers = key.lower(), _numbers(value["data"] if _is_matrix(value) else value)
+        value = value if numbers is None else numbers
+        if level and key in entries and not np.array_equal(entries[key], value):
+            unclear.add(key)
+        entries[key] = value
+    own = {str(key).lower() for key in content}
+    return {key: value for key, value in entries.items() if key in own or key not in unclear}
 
 
-def _flat(content: Entries, outer: str, level: int = 0) -> Iterator[tuple[str, Any]]:
-    """Names and entries, those below others first, with the side of a camera where an outer name says one."""
+def _is_matrix(value: Any) -> bool:
+    return isinstance(value, dict) and "data" in value
+
+
+def _flat(content: Entries, outer: str, level: int = 0) -> Iterator[tuple[str, Any, int]]:
+    """Names, entries and levels, lower ones first, with the side of a camera where an outer name says one."""
     sides = set(re.findall("left|right", outer.lower()))
     side = f"{sides.pop()}." if len(sides) == 1 else ""
     for key, value in content.items():
-        if isinstance(value, dict) and "data" not in value and level < MOST_LEVELS:
+        if isinstance(value, dict) and not _is_matrix(value) and level < MOST_LEVELS:
             yield from _flat(value, f"{outer}.{key}", level + 1)
     for key, value in content.items():
-        yield f"{side}{key}", value
+        yield f"{side}{key}", value, level
 
 
 def _of_element(node: ElementTree.Element) -> Any:

@@ -310,6 +310,21 @@ def test_matrices_may_lie_deep_below_the_names_of_sides(tmp_path):
     np.testing.assert_array_equal(rig.K_right, of.K)
 
 
+def test_matrices_of_other_cameras_beside_those_of_the_pair_are_left_out(tmp_path):
+    entries = {"K1": of.K.tolist(), "K2": of.K.tolist(), "R": np.eye(3).tolist(), "T": [-0.12, 0, 0]}
+    others = {"colour": {"camera_matrix": (2 * of.K).tolist()}, "depth": {"intrinsics": (3 * of.K).tolist()}}
+    rig = of.read_texts(tmp_path, json.dumps(entries | others))
+    np.testing.assert_array_equal(rig.K_left, of.K)
+
+
+def test_of_two_cameras_without_sides_none_is_taken_for_both(tmp_path):
+    cameras = {"cam_a": {"K": of.K.tolist()}, "cam_b": {"K": (2 * of.K).tolist()}}
+    with pytest.raises(InputError, match="K1 and K2, or K, and a baseline; got no K1, K2"):
+        of.read_texts(tmp_path, json.dumps(cameras | {"baseline": 0.12}))
+    rig = of.read_texts(tmp_path, json.dumps(cameras | {"baseline": 0.12, "K": of.K.tolist()}))
+    np.testing.assert_array_equal(rig.K_right, of.K)
+
+
 @pytest.mark.parametrize("names", [("K_left", "K_right"), ("K",), ("camera_matrix",)])
 @pytest.mark.parametrize("baseline", ["baseline", "baseline_m"])
 def test_parallel_cameras_need_only_their_baseline(names, baseline, tmp_path):
@@ -341,13 +356,11 @@ def test_virtual_kitti_is_read_by_frame_and_poses_of_another_direction_are_refus
     with pytest.raises(InputError, match="named by its frame, 0 to 2"):
         of.read_texts(tmp_path, K, T, image_names=("rgb_00009.jpg", "rgb_00009.jpg"))
     head, *lines = T.splitlines()
-    inverted = [head]
-    for line in lines:
-        frame, camera, *numbers = line.split()
-        pose = rigid([0.2, 0.4, -0.1], [0, 0, 0]) if camera == "0" else rigid([0.2, 0.4, -0.1], [0.12, 0, 0])
-        inverted.append(f"{frame} {camera} {of.words(pose)}")
+    turn = rigid([0, np.pi / 2, 0], [0, 0, 0])
+    places = {"0": turn, "1": turn @ rigid([0, 0, 0], [0.12, 0, 0])}  # camera-to-world
+    inverted = [" ".join([*line.split()[:2], of.words(places[line.split()[1]])]) for line in lines]
     with pytest.raises(InputError, match="world-to-camera poses of a rectified pair"):
-        of.read_texts(tmp_path, K, "\n".join(inverted), **choice("vkitti"))
+        of.read_texts(tmp_path, K, "\n".join([head, *inverted]), **choice("vkitti"))
 
 
 BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
