@@ -478,7 +478,7 @@ MUTANTS = [
     ),
     *of(
         "formats/storage.py",
-        ('one = named.get("D1", named.get("D", ()))', 'one = named.get("D1", ())'),
+        ('[named.get("D", ())] * 2', "[(), ()]"),
         ("if differ and name in FOR_BOTH", "if False and name in FOR_BOTH"),
         ("level < MOST_LEVELS", "level < 1"),
         ('side = f"{sides.pop()}."', 'side = f"{sides}."'),
@@ -486,7 +486,9 @@ MUTANTS = [
     ),
     *of(
         "formats/sequences.py",
-        ("Camera(K[:3, :3], (int(entries", "Camera(K[:3, :3].T, (int(entries"),
+        ("(4, 4), name)[:3, :3]", "(4, 4), name)[:3, :3].T"),
+        ("ALIGNED = 0.02", "ALIGNED = 2.0"),
+        ('float(entries["m_depthShift"])', "1000.0"),
         ('float(entries["scale"])', "None"),
         (
             'E=rigid(row, "a pose"), depth=depth, depth_per_m',

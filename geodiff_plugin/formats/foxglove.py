@@ -61,8 +61,6 @@ class FoxgloveReader(AbstractContextManager["FoxgloveReader"]):
     ``deserialize`` returns messages with the names of ROS.
     """
 
-    is2 = True
-
     def __init__(self, path: Path) -> None:
         try:
             from mcap.reader import make_reader

@@ -53,6 +53,12 @@ INTRINSICS = "intrinsics.txt camera-intrinsics.txt K.txt intrinsic/intrinsic_col
 INFOS = ("_info.txt", "info.txt")
 #: Its lines, ``name = value``.
 INFO = re.compile(r"(?m)^\s*(m_\w+)\s*=\s*(.*)$")
+#: The line by which it is told from another program's.
+INFO_MARK = "m_calibrationColorIntrinsic"
+#: The one of its depth camera, which may be left out.
+OF_DEPTH = "m_calibrationDepthIntrinsic"
+#: Depth maps show what images do where both cameras' K, in image sides, differ by less than this.
+ALIGNED = 0.02
 #: Replica as NICE-SLAM rendered it: the file of its camera beside the scenes, or in one.
 REPLICA_CAMERA = "cam_params.json"
 #: Values a metre of TUM's depth maps.
@@ -66,10 +72,9 @@ PoseAt = Callable[[float], np.ndarray | None]
 
 def _file_camera(folder: Path, published: Camera | None) -> Camera | None:
     """The intrinsics that a data set has as a file, else its published ones."""
-    infos = (parent / name for parent in (folder, folder.parent) for name in INFOS)
-    info = next((file for file in infos if file.is_file()), None)
+    info = _info_of(folder)
     if info is not None:
-        return _camera_of_info(info)
+        return info.camera
     files = [parent / name for parent in (folder, folder.parent) for name in INTRINSICS.split()]
     file = next((file for file in files if file.is_file()), None)
     return published if file is None else Camera(read_matrix(file, f"{file}")[:3, :3])
@@ -89,24 +94,50 @@ def read_tracked(folder: Path) -> Layout | None:
         paths = images_of(folder.glob(of.images)) if folder.is_dir() else []
         if not (paths and (folder / of.pose).parent.is_dir()):
             continue
-        camera, candidates = _file_camera(folder, of.camera), []
+        camera, info, candidates = _file_camera(folder, of.camera), _info_of(folder), []
+        per_m = None if info is None else info.depth_per_m
         for path in paths:
             name, E = path.name.partition(".")[0], None
             file = folder / of.pose.format(name)
             with suppress(InputError):
                 E = rigid(read_matrix(file, f"{file}"), f"the pose in {file}")
-            depth = folder / of.depth.format(name)
-            candidates.append(Candidate(CaptureFrame(name, path, E, depth), camera))
+            depth = None if info is not None and not info.aligned else folder / of.depth.format(name)
+            candidates.append(Candidate(CaptureFrame(name, path, E, depth, per_m), camera))
         return Layout(kind, "m", candidates, notes=_assumed(kind, camera))
     return None
 
 
-def _camera_of_info(file: Path) -> Camera:
-    """The colour camera of an ``_info.txt``, whose matrix is written in 16 numbers."""
-    entries = dict(INFO.findall(read_text(file, f"{file}")))
-    with reading_whole(file, "_info.txt of ScanNet's recorder or 3RScan"):
-        K = array_of(entries["m_calibrationColorIntrinsic"].split(), (4, 4), "m_calibrationColorIntrinsic")
-        return Camera(K[:3, :3], (int(entries["m_colorWidth"]), int(entries["m_colorHeight"])))
+@dataclass(frozen=True, eq=False)
+class RecorderInfo:
+    """The colour camera of an ``_info.txt``, units of its depth maps in a metre, whether they show the same.
+
+    Those of 3RScan have the view of another camera than its images.
+    """
+
+    camera: Camera
+    depth_per_m: float | None
+    aligned: bool
+
+
+def _info_of(folder: Path) -> RecorderInfo | None:
+    """What the recorder's file in a folder, or in that above, says of its cameras."""
+    for file in (parent / name for parent in (folder, folder.parent) for name in INFOS):
+        entries = dict(INFO.findall(read_text(file, f"{file}"))) if file.is_file() else {}
+        if INFO_MARK in entries:
+            with reading_whole(file, "_info.txt of ScanNet's recorder or 3RScan"):
+                colour = _camera_of_info(entries, "Color")
+                depth = _camera_of_info(entries, "Depth") if OF_DEPTH in entries else colour
+                per_m = float(entries["m_depthShift"]) if "m_depthShift" in entries else None
+                views = [camera.K[:2] / np.array(camera.size)[:, None] for camera in (colour, depth)]
+                return RecorderInfo(colour, per_m, bool(np.allclose(views[0], views[1], atol=ALIGNED)))
+    return None
+
+
+def _camera_of_info(entries: dict[str, str], which: str) -> Camera:
+    """The ``Color`` or the ``Depth`` camera, whose matrix is written in 16 numbers."""
+    name = f"m_calibration{which}Intrinsic"
+    width, height = (int(entries[f"m_{which.lower()}{side}"]) for side in ("Width", "Height"))
+    return Camera(array_of(entries[name].split(), (4, 4), name)[:3, :3], (width, height))
 
 
 def read_replica(folder: Path) -> Layout | None:

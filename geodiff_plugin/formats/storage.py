@@ -226,8 +226,8 @@ def _parallel(named: Entries, arrays: Arrays, size: Any) -> Rig:
     Ks = [named.get(name, named.get("M")) for name in ("M1", "M2")]
     if any(K is None for K in Ks):
         bad_value("the file", "a calibration with K1 and K2, or K, and a baseline", "no K1, K2")
-    one = named.get("D1", named.get("D", ()))
-    lenses = [one, one] if "M" in named else _lenses(arrays, named)
+    of_each = "M" not in named or named.keys() & {"D1", "D2"}
+    lenses = _lenses(arrays, named) if of_each else [named.get("D", ())] * 2
     left, right = (Camera(K, size, lens) for K, lens in zip(Ks, lenses, strict=True))
     return make_rig(left, right, named["baseline"].item())
 

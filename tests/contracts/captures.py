@@ -255,16 +255,16 @@ def replica(folder: Path) -> Twin:
 def three_rscan(folder: Path) -> Twin:
     """A sequence of 3RScan, or an older one of ScanNet, whose camera is that of ``_info.txt``."""
     pictures(folder, [f"frame-00000{i}.color.png" for i in range(4)])
-    depths(folder, [f"frame-00000{i}.depth.png" for i in range(4)])
+    depths(folder, [f"frame-00000{i}.depth.png" for i in range(4)], 5000.0)
     for i, E in enumerate(TRUE):
         (folder / f"frame-00000{i}.pose.txt").write_text("\n".join(words(row) for row in E))
     matrix = np.eye(4)
     matrix[:3, :3] = K
     info = f"m_versionNumber = 4\nm_sensorName = Tango\nm_colorWidth = {SIZE[0]}\nm_colorHeight = {SIZE[1]}\n"
-    info += "m_depthWidth = 224\nm_depthHeight = 172\nm_depthShift = 1000\n"
-    info += (
-        f"m_calibrationColorIntrinsic = {words(matrix)}\nm_calibrationColorExtrinsic = {words(np.eye(4))}\n"
-    )
+    info += f"m_depthWidth = {SIZE[0]}\nm_depthHeight = {SIZE[1]}\nm_depthShift = 5000\n"
+    for which in ("Color", "Depth"):
+        info += f"m_calibration{which}Intrinsic = {words(matrix)}\n"
+        info += f"m_calibration{which}Extrinsic = {words(np.eye(4))}\n"
     (folder / "_info.txt").write_text(info + "m_frames.size = 4\n")
     return Twin(folder, has_depth=True, file="_info.txt")
 

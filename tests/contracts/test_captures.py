@@ -79,6 +79,16 @@ def test_every_layout_has_a_twin_here_or_beside_its_own_tests():
     assert len(LAYOUTS) == len(set(WRITERS) - again) + len(others)
 
 
+def test_depth_maps_of_another_camera_are_left_out(tmp_path):
+    """Those of 3RScan are 224x172 beside images of 960x540."""
+    twin = three_rscan(tmp_path / "scan")
+    file = twin.path / "_info.txt"
+    file.write_text(file.read_text().replace(f"m_depthHeight = {SIZE[1]}", f"m_depthHeight = {SIZE[1] // 2}"))
+    assert all(frame.depth is None for frame in opened(twin).frames)
+    file.write_text("fps: 30\n")  # of another program: the camera is not known
+    assert "capture.assumed-k" in [note.code for note in opened(twin).notes]
+
+
 def test_metashape_bends_a_lens_by_its_own_formula(tmp_path):
     """x' = x (1 + K1 r2 + K2 r4) + P1 (r2 + 2 x2) + 2 P2 x y, of its manual: P1 and P2 are not OpenCV's."""
     folder = metashape(tmp_path / "scan").path
