@@ -1,11 +1,14 @@
 """Refits what the confidence promises, on pairs with truth: coefficients to paste, and how they do elsewhere.
 
+Beside it: what is said of pixels by the texture around them.
+
 python -m tests.benchmarks.confidence --data DIR --strengths exact,5%,20%
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -15,6 +18,7 @@ import typer
 from PIL import Image
 from rich.console import Console
 from rich.table import Table
+from scipy.ndimage import uniform_filter
 from scipy.optimize import minimize
 from scipy.special import expit
 from tqdm import tqdm
@@ -34,7 +38,9 @@ from tests.lab.strength import EmulatedPrior
 
 __all__ = [
     "Decile",
+    "OfTexture",
     "Observed",
+    "by_texture",
     "calibrate",
     "deciles",
     "fit_log_odds",
@@ -42,6 +48,7 @@ __all__ = [
     "observe_emulated",
     "observe_matches",
     "promised",
+    "texture_of",
 ]
 
 #: Which sign each coefficient of ``consistency.LOG_ODDS``, and of ``BY_EVIDENCE``, may have; 0 for any.
@@ -110,13 +117,34 @@ def deciles(probability: np.ndarray, right: np.ndarray, weights: np.ndarray) -> 
 
 #: Pixels of a pair that are looked at; more say nothing new.
 PIXELS = 5000
+#: Half width in px of the window over which the texture of an image is measured: that of the contrast.
+TEXTURE_REACH = consistency.CONTRAST_REACH
+#: Upper bounds of the classes of texture but the last: mean horizontal step of brightness, share of white.
+TEXTURES = (0.005, 0.01, 0.02, 0.04)
+#: Confidence from which on a pixel is said to be right.
+SURE = 0.9
 
 
 class Observed(NamedTuple):
-    """Pixels of one pair: ``evidence (N, F)`` float64, and whether each was ``right (N,)``."""
+    """Pixels of one pair: what is known of each, and whether it was right."""
 
-    evidence: np.ndarray
-    right: np.ndarray
+    evidence: np.ndarray  # (N, F) float64
+    right: np.ndarray  # (N,) bool
+    stated: np.ndarray | None = None  # (N,) the confidence of the output
+    texture: np.ndarray | None = None  # (N,) ``texture_of`` the left image
+
+
+def texture_of(image: np.ndarray) -> np.ndarray:
+    """``(H, W)`` mean step of brightness between neighbours of a row around a pixel, of white.
+
+    What a match of a rectified pair can hold on to; noise counts like paint.
+
+    Args:
+        image: ``(H, W, 3)`` uint8.
+    """
+    grey = image.astype(np.float64).mean(-1) / 255.0
+    steps = np.abs(np.diff(grey, axis=1, prepend=grey[:, :1]))
+    return uniform_filter(steps, 2 * TEXTURE_REACH + 1, mode="nearest")
 
 
 def _drawn(evidence: np.ndarray, right: np.ndarray, where: np.ndarray, seed: int) -> Observed:
@@ -149,7 +177,10 @@ def observe_depth(sample: StereoSample, settings: Settings, priors: PriorCache) 
     evidence = confidence.depth_evidence(*maps, spread, known)[0]
     depth_m = out.prediction[0, 0].cpu().numpy()
     right = np.abs(depth_m / np.where(sample.valid, sample.depth_m, 1.0) - 1.0) < confidence.RIGHT_WITHIN
-    return _drawn(evidence.cpu().numpy(), right, sample.valid, settings.seed)
+    shown = np.stack([out.confidence[0, 0].cpu().numpy(), texture_of(sample.left)])
+    both = np.concatenate([evidence.cpu().numpy(), shown])
+    drawn = _drawn(both, right, sample.valid, settings.seed)
+    return Observed(drawn.evidence[:, :-2], drawn.right, drawn.evidence[:, -2], drawn.evidence[:, -1])
 
 
 def observe_emulated(sample: StereoSample, strengths: Sequence[str]) -> list[Observed]:
@@ -199,7 +230,10 @@ def _stack(pairs: Sequence[Observed]) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def _joined(parts: Sequence[Observed]) -> Observed:
-    return Observed(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("evidence", "right")))
+    """The pixels of all parts; of matches, nothing is stated."""
+    fields = {name: [getattr(part, name) for part in parts] for name in Observed._fields}
+    known = {name: each for name, each in fields.items() if all(values is not None for values in each)}
+    return Observed(**{name: np.concatenate(each) for name, each in known.items()})
 
 
 def calibrate(
@@ -237,6 +271,62 @@ def _print_deciles(
     console.print(title, highlight=False, soft_wrap=True)
     console.print(table)
     console.print(f"largest gap between promised and kept: {worst:.3f}", highlight=False)
+
+
+class OfTexture(NamedTuple):
+    """What is said of the pixels of one class of texture, and what is so; every pair weighs the same."""
+
+    share: float  # of all pixels
+    within: float  # of these, share within ``confidence.RIGHT_WITHIN``
+    stated: float  # their mean confidence
+    sure: float  # share of these that is said to be right with ``SURE`` or more
+    kept: float  # of the sure ones, share within ``confidence.RIGHT_WITHIN``; NaN where none is
+
+
+def by_texture(pairs: Sequence[Observed]) -> list[OfTexture]:
+    """One row for each class of ``TEXTURES``; NaN in a class without pixels."""
+    _, right, weights = _stack(pairs)
+    stated, texture = (np.concatenate([getattr(p, name) for p in pairs]) for name in ("stated", "texture"))
+    rows = []
+    for k in range(len(TEXTURES) + 1):
+        own = np.digitize(texture, TEXTURES) == k
+        sure = own & (stated >= SURE)
+        mass, of_sure = weights[own].sum(), weights[sure].sum()
+        within, said = (weights[own] @ values[own] for values in (right, stated))
+        with np.errstate(invalid="ignore"):
+            parts = np.array([within, said, of_sure]) / mass
+            kept = np.float64(weights[sure] @ right[sure]) / of_sure
+        share_within, mean_stated, share_sure = map(float, parts)
+        rows.append(
+            OfTexture(float(mass / weights.sum()), share_within, mean_stated, share_sure, float(kept))
+        )
+    return rows
+
+
+def _print_textures(console: Console, title: str, pairs: Sequence[Observed]) -> None:
+    """The table of ``by_texture``."""
+    heads = (
+        "pixels",
+        f"within {confidence.RIGHT_WITHIN:.0%}",
+        "mean confidence",
+        f"said >= {SURE:g}",
+        "of these within",
+    )
+    table = Table("texture, % of white", *heads)
+    bounds = [f"{100.0 * bound:g}" for bound in TEXTURES]
+    names = [f"below {bounds[0]}", *map(" to ".join, pairwise(bounds)), f"{bounds[-1]} and more"]
+    for name, row in zip(names, by_texture(pairs), strict=True):
+        table.add_row(name, *(f"{value:.3f}" for value in row))
+    console.print(f"{title}: what is said of pixels by the texture around them", highlight=False)
+    console.print(table)
+
+
+def _print_all_textures(console: Console, observed: Mapping[str, Sequence[Observed]]) -> None:
+    """The table of each data and of all."""
+    for root, own in observed.items():
+        _print_textures(console, root, own)
+    if len(observed) > 1:
+        _print_textures(console, "all", [pair for own in observed.values() for pair in own])
 
 
 def _print(
@@ -311,6 +401,8 @@ def main(
         if count < 2:  # each half is judged by the other
             bad_value("data", "folders with at least two pairs with truth", f"{count} in {', '.join(data)}")
         _print(console, kind, where, name, observed, signs, shipped)
+        if kind == "depth":
+            _print_all_textures(console, observed)
 
 
 if __name__ == "__main__":

@@ -10,13 +10,16 @@ import pytest
 
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from tests.benchmarks.confidence import (
+    TEXTURES,
     Observed,
+    by_texture,
     calibrate,
     deciles,
     fit_log_odds,
     main,
     observe_emulated,
     promised,
+    texture_of,
 )
 
 TRUE = (-0.5, 1.2, -0.7)
@@ -72,6 +75,24 @@ def test_deciles_of_a_promise_that_is_kept_by_half():
     found = deciles(np.array([0.05, 0.95, 0.95, 1.0]), np.array([0, 1, 0, 1]), np.array([1.0, 1.0, 1.0, 2.0]))
     assert [round(d.share, 2) for d in found] == [0.2, 0.8]
     assert found[1].kept == pytest.approx(0.75) and found[1].promised == pytest.approx(0.975)
+
+
+def test_classes_of_texture_are_counted_apart():
+    """A blank half that is right in 1 of 2 and a textured one in 3 of 4; only one of each is called sure."""
+    right = np.array([1, 0, 1, 1, 0, 1], bool)
+    stated = np.array([0.95, 0.4, 0.9, 0.5, 0.5, 0.1])
+    texture = np.array([0.0, 0.0, 0.5, 0.5, 0.5, 0.5])
+    rows = by_texture([Observed(np.ones((6, 1)), right, stated, texture)])
+    assert len(rows) == len(TEXTURES) + 1 and np.isnan(rows[1].within)
+    np.testing.assert_allclose(rows[0], (2 / 6, 0.5, 0.675, 0.5, 1.0))
+    np.testing.assert_allclose(rows[-1], (4 / 6, 0.75, 0.5, 0.25, 1.0))
+
+
+def test_texture_is_the_mean_step_of_brightness_along_rows():
+    image = np.zeros((80, 120, 3), np.uint8)
+    image[:, ::2] = 51  # a step of a fifth of white at every pixel
+    np.testing.assert_allclose(texture_of(image)[:, 40:-40], 0.2, rtol=1e-6)
+    np.testing.assert_allclose(texture_of(np.swapaxes(image, 0, 1)), 0.0, atol=1e-12)  # stripes along rows
 
 
 @pytest.mark.slow
