@@ -175,9 +175,9 @@ class Indicators:
 class Verdict:
     """Whether one image's depth can be trusted: whether anything in the pictures speaks against it.
 
-    They cannot show a wrong length of the baseline, nor, of a rectified pair, a wrong focal length. They do not
-    show either what shifts matches along epipolar lines unless something then lies behind infinity: cx of the
-    right camera, the yaw of nearly parallel ones, a stretched picture, a rolling shutter, moving things.
+    They cannot show a wrong length of the baseline, nor, of a rectified pair, a wrong focal length. Of what
+    shifts matches along their epipolar lines they show only what puts things behind infinity: cx of the right
+    camera, the yaw of nearly parallel ones, a stretched picture, a rolling shutter, moving things.
     """
 
     status: str  # "trusted", "not trusted", or "not judged": there was nothing to compare it with
