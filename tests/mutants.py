@@ -366,7 +366,7 @@ MUTANTS = [
         ("USUAL_BEND_PX = 1.0", "USUAL_BEND_PX = 1.2"),
         ("USUAL_DISTORTION = 0.08", "USUAL_DISTORTION = 0.1"),
         ("USUAL_SCALE = 0.06", "USUAL_SCALE = 0.08"),
-        ("USUAL_SPREAD = 0.14", "USUAL_SPREAD = 0.12"),
+        ("USUAL_SPREAD = 0.15", "USUAL_SPREAD = 0.13"),
         ("across_px * pixels_of_matches(size), behind_px", "across_px, behind_px"),
         ("abs(found.distortion) - USUAL", "found.distortion - USUAL"),
         ("deviation**2 - usual**2", "(deviation - usual) ** 2"),
@@ -392,7 +392,7 @@ MUTANTS = [
     ),
     *of(
         "pose/refine.py",
-        ("_MOST_SPREAD = 0.15", "_MOST_SPREAD = 0.13"),
+        ("_MOST_SPREAD = 0.16", "_MOST_SPREAD = 0.14"),
         ("0.0 if misfit.rig else depths_apart", "depths_apart"),
         tests=(f"{UNIT}pose_refine.py",),
     ),

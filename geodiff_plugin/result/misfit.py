@@ -32,7 +32,7 @@ USUAL_DISTORTION = 0.08
 #: Relative standard deviation of the scale of refined poses of right pairs.
 USUAL_SCALE = 0.06
 #: Change of log depth by another pose that fits a right pair as well.
-USUAL_SPREAD = 0.14
+USUAL_SPREAD = 0.15
 
 
 class Misfit(NamedTuple):

@@ -35,8 +35,8 @@ def view_at(*centre: float) -> CameraView:
         ({}, SIZE, (0, 0, 0)),
         # Of right pairs: matches within 0.45 px of their lines, k1 up to .08.
         ({"epipolar_px": 0.44, "behind_px": 0.0, "distortion": -0.079}, SIZE, (0, 0, 0)),
-        # Refined poses of right pairs: bent by up to 1 px, a scale known to 6 %, others 14 % apart.
-        ({"straightened_px": 0.99, "scale_spread": 0.059, "depth_spread": 0.139}, SIZE, (0, 0, 0)),
+        # Refined poses of right pairs: bent by up to 1 px, a scale known to 6 %, others 15 % apart.
+        ({"straightened_px": 0.99, "scale_spread": 0.059, "depth_spread": 0.149}, SIZE, (0, 0, 0)),
         ({"epipolar_px": 0.75}, SIZE, (0.6, 0, 0)),  # .75^2 = .45^2 + .6^2
         ({"behind_px": 3.0}, SIZE, (3.0, 0, 0)),
         ({"epipolar_px": 0.75, "behind_px": 0.8}, SIZE, (1.0, 0, 0)),
@@ -45,8 +45,8 @@ def view_at(*centre: float) -> CameraView:
         ({"distortion": 0.081}, SIZE, (0, 0.001, 0)),
         ({"distortion": -0.25}, SIZE, (0, 0.17, 0)),
         ({"scale_spread": 0.1}, SIZE, (0, 0, 0.08)),
-        ({"depth_spread": 0.25}, SIZE, (0, 0, math.sqrt(0.25**2 - 0.14**2))),
-        ({"scale_spread": 0.1, "depth_spread": 0.25}, SIZE, (0, 0, math.sqrt(0.08**2 + 0.25**2 - 0.14**2))),
+        ({"depth_spread": 0.25}, SIZE, (0, 0, 0.2)),
+        ({"scale_spread": 0.1, "depth_spread": 0.25}, SIZE, (0, 0, math.hypot(0.08, 0.2))),
         # Residuals are in pixels of a grid of 832 columns at most, what lies behind infinity in the image's.
         ({"epipolar_px": 0.75, "behind_px": 0.0}, (900, 1664), (1.2, 0, 0)),
         ({"behind_px": 3.0}, (900, 1664), (3.0, 0, 0)),
