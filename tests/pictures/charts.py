@@ -93,6 +93,15 @@ SHARES = tuple(
         (6, "rendered", "said, of those > 20% off"),
     )
 )
+PROMISES = tuple(
+    Column(place, f"{data}: {what}")
+    for place, data, what in (
+        (3, "real", "within 10 %"),
+        (4, "real", "confidence"),
+        (8, "rendered", "within 10 %"),
+        (9, "rendered", "confidence"),
+    )
+)
 CHARTS = (
     Chart("results", 1, f"Mean AbsRel; {LOWER}"),
     Chart("results", 2, "AbsRel of guided minus that of the other method, with its interval"),
@@ -107,6 +116,9 @@ CHARTS = (
     Chart("results-pose", 4, f"AbsRel; {LOWER}", turned=True, rows="mean of"),
     Chart(
         "results-trust", 1, "Shares that were not trusted, and that got a warning or were not trusted", SHARES
+    ),
+    Chart(
+        "results-trust", 2, "Share within 10 % of the truth, and the confidence that promises it", PROMISES
     ),
     Chart("strength", 1, f"Errors by the prior's own error; {LOWER}", names=2, one_scale=False),
     Chart(
