@@ -93,6 +93,7 @@ SHARES = tuple(
         (6, "rendered", "said, of those > 20% off"),
     )
 )
+PROMISED = "Share within 10 % of the truth, and the confidence that promises it"
 PROMISES = tuple(
     Column(place, f"{data}: {what}")
     for place, data, what in (
@@ -117,9 +118,8 @@ CHARTS = (
     Chart(
         "results-trust", 1, "Shares that were not trusted, and that got a warning or were not trusted", SHARES
     ),
-    Chart(
-        "results-trust", 2, "Share within 10 % of the truth, and the confidence that promises it", PROMISES
-    ),
+    Chart("results-trust", 2, PROMISED, (Column(3), Column(4)), names=2),
+    Chart("results-trust", 3, PROMISED, PROMISES),
     Chart("strength", 1, f"Errors by the prior's own error; {LOWER}", names=2, one_scale=False),
     Chart(
         "strength",
