@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,6 +26,7 @@ from rich.table import Table
 from torch import Tensor
 
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior, read_calibration
+from geodiff_plugin._checks import check_choice
 from geodiff_plugin.algorithm.member import Member
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.metrics import evaluate_depth
@@ -45,6 +46,8 @@ STAGES = {
 }
 #: Confidence from which on a match is sure.
 SURE = 0.5
+#: Functions of ``result.finish`` that ``--without`` leaves out, by the word that it takes.
+PARTS = {"votes": "vote_depth", "flattening": "flatten"}
 #: Fewer pixels make no plane.
 FEWEST_PIXELS = 50
 #: Name of the file with hand-marked planes, beside the calibration of its pairs.
@@ -233,13 +236,26 @@ def _marked(root: Path) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray], Ri
             yield name, tuple(map(np.asarray, sides)), rig, planes
 
 
+def _unchanged(depth_m: Tensor, *_: Any) -> Tensor:
+    """In place of a part that is left out."""
+    return depth_m
+
+
 def main(
     data: Annotated[list[str], typer.Option(help="Folder with planes.json, data sets or synthetic-plain:N.")],
     prior: Annotated[str, typer.Option(help="The prior that is guided.")] = "bundled",
     seed: Annotated[int, typer.Option(help="Of the call.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for a figure of each pair.")] = None,
+    without: Annotated[str, typer.Option(help="A part to leave out: votes or flattening.")] = "",
 ) -> None:
     """Print how flat planes and how smooth rendered surfaces are by stage, and draw the stages."""
+    if without:
+        check_choice(without, "without", PARTS)
+    with patch.object(finish, PARTS[without], _unchanged) if without else nullcontext():
+        _run(data, prior, seed, out)
+
+
+def _run(data: Sequence[str], prior: str, seed: int, out: Path | None) -> None:
     pipe = enable_geometry_guidance(load_prior(prior))
     pipe.set_progress_bar_config(disable=True)
     console, planes, surfaces = Console(width=150), {}, {}

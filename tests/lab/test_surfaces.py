@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior
+from geodiff_plugin._checks import InputError
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from tests.lab.surfaces import STAGES, draw_stages, flatness, guided_stages, main
 
@@ -59,3 +60,13 @@ def test_the_table_names_every_pair_with_truth(capsys):
     shown = capsys.readouterr().out
     assert "plain0000" in shown
     assert "mean" in shown
+
+
+def test_a_part_that_is_left_out_changes_the_table_and_others_are_refused(capsys):
+    shown = []
+    for without in ("", "votes", "flattening"):
+        main(data=[SMALL], without=without)
+        shown.append(capsys.readouterr().out)
+    assert len(set(shown)) == 3
+    with pytest.raises(InputError, match="without"):
+        main(data=[SMALL], without="walls")
