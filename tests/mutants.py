@@ -365,6 +365,7 @@ MUTANTS = [
         ("USUAL_PX = 0.45", "USUAL_PX = 0.5"),
         ("USUAL_BEND_PX = 1.0", "USUAL_BEND_PX = 1.2"),
         ("USUAL_DISTORTION = 0.08", "USUAL_DISTORTION = 0.1"),
+        ("found.behind_infinity > USUAL_BEHIND", "found.behind_infinity > 0.0"),
         ("USUAL_SCALE = 0.06", "USUAL_SCALE = 0.08"),
         ("USUAL_SPREAD = 0.15", "USUAL_SPREAD = 0.13"),
         ("across_px * pixels_of_matches(size), behind_px", "across_px, behind_px"),
@@ -439,6 +440,7 @@ MUTANTS = [
         "pose/lens.py",
         ("np.c_[(ahead - behind)", "np.c_[(behind - ahead)"),
         ("abs(k1) - UNCERTAIN * error", "abs(k1) + UNCERTAIN * error"),
+        (", _error_by_blocks(H, pulls, block))", ", 0.0)"),
         tests=(f"{UNIT}pose_refine.py",),
     ),
     *of(

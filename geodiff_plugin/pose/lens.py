@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from geodiff_plugin.pose.tracks import FEWEST, Tracks, across_lines, residuals_px
+from geodiff_plugin.pose.tracks import FEWEST, Tracks, across_lines, blocks, residuals_px
 
 #: Matches further off their epipolar lines than this are wrong, pixels.
 MOST_OFF_PX = 12.0
@@ -18,7 +18,7 @@ STEP_K1 = 0.01
 #: No lens of a camera with a rectilinear picture has more.
 MOST_K1 = 0.6
 #: So many standard errors of an estimate are not counted.
-UNCERTAIN = 3.0
+UNCERTAIN = 4.0
 
 
 def _without(px: np.ndarray, K: np.ndarray, k1: float) -> np.ndarray:
@@ -38,7 +38,9 @@ def remaining_distortion(tracks: Tracks, T: np.ndarray) -> float:
 
     It minimises ``sum_i rho(e_i(k1) + c)``, with ``e_i`` the signed distance of match i from its epipolar
     line when ``k1`` is removed from both pictures, ``c`` a shift across the lines, and Cauchy's ``rho``;
-    the estimate is moved towards 0 by ``UNCERTAIN`` standard errors.
+    the estimate is moved towards 0 by ``UNCERTAIN`` standard errors. The standard error is the larger of two:
+    as if matches erred independently, and as the sums over blocks of the left image show, since neighbours
+    err alike.
 
     Args:
         tracks: of one right view.
@@ -50,7 +52,7 @@ def remaining_distortion(tracks: Tracks, T: np.ndarray) -> float:
     tracks = tracks.kept(residuals_px(tracks, T[None])[0] < MOST_OFF_PX)
     if len(tracks) < FEWEST:
         return float("nan")
-    k1, error = 0.0, np.inf
+    k1, error, block = 0.0, np.inf, blocks(tracks)
     for _ in range(STEPS):
         off = _residuals(tracks, T, k1)
         ahead, behind = (_residuals(tracks, T, k1 + way * STEP_K1) for way in (1, -1))
@@ -58,6 +60,18 @@ def remaining_distortion(tracks: Tracks, T: np.ndarray) -> float:
         scale = max(1.4826 * float(np.median(np.abs(off - np.median(off)))), 0.1)
         weight = 1.0 / (1.0 + ((off - np.median(off)) / (2.0 * scale)) ** 2)
         H = (A * weight[:, None]).T @ A + 1e-9 * np.eye(2)
-        k1 = float(np.clip(k1 - np.linalg.solve(H, (A * weight[:, None]).T @ off)[0], -MOST_K1, MOST_K1))
-        error = scale * float(np.sqrt(np.linalg.inv(H)[0, 0]))
+        step = np.linalg.solve(H, (A * weight[:, None]).T @ off)
+        k1 = float(np.clip(k1 - step[0], -MOST_K1, MOST_K1))
+        pulls = A * (weight * (off - A @ step))[:, None]
+        error = max(scale * float(np.sqrt(np.linalg.inv(H)[0, 0])), _error_by_blocks(H, pulls, block))
     return float(np.sign(k1)) * max(abs(k1) - UNCERTAIN * error, 0.0)
+
+
+def _error_by_blocks(H: np.ndarray, pulls: np.ndarray, block: np.ndarray) -> float:
+    """Standard error of the first unknown where the matches of a block ``(N,)`` may err alike.
+
+    From the normal equations' ``H (2, 2)`` and the residuals' part in their right side, ``pulls (N, 2)``.
+    """
+    of_blocks = np.stack([np.bincount(block, pull) for pull in pulls.T], axis=1)
+    inverse = np.linalg.inv(H)
+    return float(np.sqrt((inverse @ of_blocks.T @ of_blocks @ inverse)[0, 0]))

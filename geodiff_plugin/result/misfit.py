@@ -27,6 +27,8 @@ MATCH_NOISE_PX = 0.25
 USUAL_PX = 0.45
 #: Root mean square displacement of right images that brings matches of right pairs to their lines, pixels.
 USUAL_BEND_PX = 1.0
+#: Share of the matches that lie behind infinity in right pairs: on blank walls, a few of few matches.
+USUAL_BEHIND = 0.04
 #: Radial coefficient k1 that right pairs seem to have.
 USUAL_DISTORTION = 0.08
 #: Relative standard deviation of the scale of refined poses of right pairs.
@@ -51,7 +53,7 @@ def misfit_of(found: Indicators, size: tuple[int, int]) -> Misfit:
     across_px = math.hypot(
         _beyond(found.epipolar_px, USUAL_PX), _beyond(found.straightened_px, USUAL_BEND_PX)
     )
-    behind_px = _beyond(found.behind_px, 0.0)
+    behind_px = found.behind_px if found.behind_infinity > USUAL_BEHIND else 0.0
     return Misfit(
         math.hypot(across_px * pixels_of_matches(size), behind_px),
         0.0 if math.isnan(found.distortion) else max(0.0, abs(found.distortion) - USUAL_DISTORTION),

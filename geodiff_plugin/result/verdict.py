@@ -71,9 +71,9 @@ EPIPOLAR_WRONG = 4.0
 #: A larger share of matches behind infinity is not trusted: it was up to .015 for right pairs, and .12 to .88
 #: where the principal point or the rotation was off and things were far away.
 MOST_BEHIND = 0.05
-#: A larger radial coefficient k1 left in both pictures is not trusted: it was up to .08 for right pairs, and
-#: .16 or more where a distortion of .25 had not been removed.
-MOST_DISTORTION = 0.15
+#: A larger radial coefficient k1 left in both pictures is not trusted: what is certain of it was up to .07
+#: for right pairs, and .12 to .46 where a distortion of .25 had not been removed, but for two of few matches.
+MOST_DISTORTION = 0.11
 #: A refined pose whose scale is less certain than this is not trusted, unless known depths give the scale.
 MOST_SCALE_SPREAD = 0.1
 #: Known depths that fix a scale and a shift, and show when one of them is wrong.

@@ -38,8 +38,9 @@ def view_at(*centre: float) -> CameraView:
         # Refined poses of right pairs: bent by up to 1 px, a scale known to 6 %, others 15 % apart.
         ({"straightened_px": 0.99, "scale_spread": 0.059, "depth_spread": 0.149}, SIZE, (0, 0, 0)),
         ({"epipolar_px": 0.75}, SIZE, (0.6, 0, 0)),  # .75^2 = .45^2 + .6^2
-        ({"behind_px": 3.0}, SIZE, (3.0, 0, 0)),
-        ({"epipolar_px": 0.75, "behind_px": 0.8}, SIZE, (1.0, 0, 0)),
+        ({"behind_px": 3.0, "behind_infinity": 0.041}, SIZE, (3.0, 0, 0)),
+        ({"behind_px": 3.0, "behind_infinity": 0.039}, SIZE, (0, 0, 0)),  # single matches, as on blank walls
+        ({"epipolar_px": 0.75, "behind_px": 0.8, "behind_infinity": 0.1}, SIZE, (1.0, 0, 0)),
         ({"straightened_px": 1.25}, SIZE, (0.75, 0, 0)),
         ({"straightened_px": 1.25, "epipolar_px": 0.75}, SIZE, (math.hypot(0.75, 0.6), 0, 0)),
         ({"distortion": 0.081}, SIZE, (0, 0.001, 0)),
@@ -49,7 +50,7 @@ def view_at(*centre: float) -> CameraView:
         ({"scale_spread": 0.1, "depth_spread": 0.25}, SIZE, (0, 0, math.hypot(0.08, 0.2))),
         # Residuals are in pixels of a grid of 832 columns at most, what lies behind infinity in the image's.
         ({"epipolar_px": 0.75, "behind_px": 0.0}, (900, 1664), (1.2, 0, 0)),
-        ({"behind_px": 3.0}, (900, 1664), (3.0, 0, 0)),
+        ({"behind_px": 3.0, "behind_infinity": 0.1}, (900, 1664), (3.0, 0, 0)),
     ],
 )
 def test_only_what_right_pairs_do_not_have_is_a_misfit(found, size, expected):

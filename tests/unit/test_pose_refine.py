@@ -262,6 +262,16 @@ def test_distortion_of_both_pictures_is_measured(k1: float, E: np.ndarray) -> No
     assert np.isnan(remaining_distortion(bent.kept(slice(39)), Ts[0]))
 
 
+def test_errors_that_neighbours_share_are_no_distortion() -> None:
+    """Tenths of the picture that lie .6 px beside their lines, as matches of single surfaces do."""
+    tracks, Ts, _ = make_tracks([RIG], count=800, outliers=0.0, noise_px=0.05)
+    part = (tracks.left_px // 51.1).astype(int)
+    for seed in range(12):
+        off_px = np.random.default_rng(seed).normal(0.0, 0.6, (20, 20))[part[:, 1], part[:, 0]]
+        right_px = tracks.right_px + np.stack([np.zeros_like(off_px), off_px], axis=1)
+        assert abs(remaining_distortion(replace(tracks, right_px=right_px), Ts[0])) < 0.002
+
+
 def bent(tracks: Tracks, px: float) -> Tracks:
     moved = tracks.right_px.copy()
     moved[0, :, 1] += px * ((tracks.right_px[0, :, 0] - 255.5) / 256) ** 2
