@@ -5,6 +5,7 @@ They are matched by SIFT, and by optical flow once there is a first depth.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -214,7 +215,7 @@ def behind_infinity(tracks: Tracks, Ts: np.ndarray) -> Behind:
         beyond_px.append(np.where((inverse_depth < 0) & (away_px > _BEHIND_PX), away_px, 0.0))
     every_px = np.concatenate(beyond_px)
     if len(every_px) < FEWEST:
-        return Behind(float("nan"), float("nan"))
+        return Behind(math.nan, math.nan)
     return Behind(float((every_px > 0).mean()), float(np.quantile(every_px, _FARTHEST_BEHIND)))
 
 

@@ -142,7 +142,8 @@ def indicators_of(
         known |= {"behind_infinity": pose.behind_infinity, "distortion": pose.distortion}
         known["depth_spread"] = pose.depth_spread
         known["straightened_px"] = max(pose.straightened_px, default=0.0)
-        known["behind_px"] = pose.behind_px * pixels_of_matches(native.size)
+        if not math.isnan(pose.behind_px):  # a product would be another NaN, and verdicts would differ by it
+            known["behind_px"] = pose.behind_px * pixels_of_matches(native.size)
         known["mistakes"] = tuple(m for m in pose.warnings if m.forbids_trust and m.code != INVERSE.code)
     if native.views and has_unit:
         known["scale_spread"] = (pose and pose.scale_spread) or math.nan
