@@ -440,7 +440,7 @@ MUTANTS = [
         "pose/lens.py",
         ("np.c_[(ahead - behind)", "np.c_[(behind - ahead)"),
         ("abs(k1) - UNCERTAIN * error", "abs(k1) + UNCERTAIN * error"),
-        (", _error_by_blocks(H, pulls, block))", ", 0.0)"),
+        (", _error_by_blocks(inverse, pulls, blocks(tracks)))", ", 0.0)"),
         tests=(f"{UNIT}pose_refine.py",),
     ),
     *of(

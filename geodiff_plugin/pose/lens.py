@@ -52,7 +52,7 @@ def remaining_distortion(tracks: Tracks, T: np.ndarray) -> float:
     tracks = tracks.kept(residuals_px(tracks, T[None])[0] < MOST_OFF_PX)
     if len(tracks) < FEWEST:
         return float("nan")
-    k1, error, block = 0.0, np.inf, blocks(tracks)
+    k1 = 0.0
     for _ in range(STEPS):
         off = _residuals(tracks, T, k1)
         ahead, behind = (_residuals(tracks, T, k1 + way * STEP_K1) for way in (1, -1))
@@ -62,16 +62,16 @@ def remaining_distortion(tracks: Tracks, T: np.ndarray) -> float:
         H = (A * weight[:, None]).T @ A + 1e-9 * np.eye(2)
         step = np.linalg.solve(H, (A * weight[:, None]).T @ off)
         k1 = float(np.clip(k1 - step[0], -MOST_K1, MOST_K1))
-        pulls = A * (weight * (off - A @ step))[:, None]
-        error = max(scale * float(np.sqrt(np.linalg.inv(H)[0, 0])), _error_by_blocks(H, pulls, block))
+    inverse, pulls = np.linalg.inv(H), A * (weight * (off - A @ step))[:, None]
+    error = max(scale * float(np.sqrt(inverse[0, 0])), _error_by_blocks(inverse, pulls, blocks(tracks)))
     return float(np.sign(k1)) * max(abs(k1) - UNCERTAIN * error, 0.0)
 
 
-def _error_by_blocks(H: np.ndarray, pulls: np.ndarray, block: np.ndarray) -> float:
+def _error_by_blocks(inverse: np.ndarray, pulls: np.ndarray, block: np.ndarray) -> float:
     """Standard error of the first unknown where the matches of a block ``(N,)`` may err alike.
 
-    From the normal equations' ``H (2, 2)`` and the residuals' part in their right side, ``pulls (N, 2)``.
+    From the inverse ``(2, 2)`` of the normal equations' matrix, and what every match adds to their right
+    side at the minimum, ``pulls (N, 2)``.
     """
     of_blocks = np.stack([np.bincount(block, pull) for pull in pulls.T], axis=1)
-    inverse = np.linalg.inv(H)
     return float(np.sqrt((inverse @ of_blocks.T @ of_blocks @ inverse)[0, 0]))

@@ -84,25 +84,20 @@ class Chart:
 
 
 LOWER = "lower is better"
-SHARES = tuple(
-    Column(place, f"{data}: {what}")
-    for place, data, what in (
-        (2, "real", "not trusted"),
-        (3, "real", "said, of those > 20% off"),
-        (5, "rendered", "not trusted"),
-        (6, "rendered", "said, of those > 20% off"),
-    )
-)
 PROMISED = "Share within 10 % of the truth, and the confidence that promises it"
-PROMISES = tuple(
-    Column(place, f"{data}: {what}")
-    for place, data, what in (
-        (3, "real", "within 10 %"),
-        (4, "real", "confidence"),
-        (8, "rendered", "within 10 %"),
-        (9, "rendered", "confidence"),
+
+
+def _real_and_rendered(first_real: int, first_rendered: int, *names: str) -> tuple[Column, ...]:
+    """Columns of the names, side by side from a first one on, of real pairs and of rendered ones."""
+    return tuple(
+        Column(first + place, f"{data}: {name}")
+        for data, first in (("real", first_real), ("rendered", first_rendered))
+        for place, name in enumerate(names)
     )
-)
+
+
+SHARES = _real_and_rendered(2, 5, "not trusted", "said, of those > 20% off")
+PROMISES = _real_and_rendered(3, 8, "within 10 %", "confidence")
 CHARTS = (
     Chart("results", 1, f"Mean AbsRel; {LOWER}"),
     Chart("results", 2, "AbsRel of guided minus that of the other method, with its interval"),
