@@ -8,13 +8,16 @@ the thread that calls. OpenCV's own, of the whole process, is left alone: more a
 from __future__ import annotations
 
 import contextvars
+import functools
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping, ValuesView
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import is_dataclass
 from typing import Generic, TypeVar
 
 import cv2
 import torch
+from torch import Tensor
 
 T = TypeVar("T")
 
@@ -62,28 +65,72 @@ class Beside(Generic[T]):
 
     A guided call on CUDA makes its evidence like this, beside the network's first steps, which are not
     guided; in it the pose check, which keeps the CPU busy while the GPU matches; and after it the matches of
-    rows, which only the result asks for. The thread has the caller's context variables and stream, and takes
-    no gradients. On other devices both would compete for the same cores, so the function is called at once.
+    rows, which only the result asks for. The thread has the caller's context variables and takes no
+    gradients. On other devices both would compete for the same cores, so the function is called at once.
+
+    Args:
+        function: what is worked out.
+        device: on which it works.
+        own_stream: its work on CUDA goes to a stream beside the caller's, after what the caller has asked of
+            the device until now. What it reads from the device then does not wait for the caller's network.
     """
 
-    def __init__(self, function: Callable[[], T], device: torch.device) -> None:
-        self._pool = None
+    def __init__(self, function: Callable[[], T], device: torch.device, *, own_stream: bool = False) -> None:
+        self._pool, self._stream = None, None
         if not leaves_cpu_free(device):
-            answer = function()
-            self.result: Callable[[], T] = lambda: answer
+            self._answer = Future[T]()
+            self._answer.set_result(function())
             return
-        context = contextvars.copy_context()
-        stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
+        context, ready = contextvars.copy_context(), None
+        if device.type == "cuda":
+            self._stream = torch.cuda.current_stream(device)
+            if own_stream:
+                ready, self._stream = self._stream.record_event(), _stream_beside(device)
 
         def work() -> T:
-            with torch.no_grad(), torch.cuda.stream(stream):
+            with torch.no_grad(), torch.cuda.stream(self._stream):
+                if ready is not None:
+                    ready.wait()
                 return context.run(function)
 
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="geodiff-evidence")
-        self.result = self._pool.submit(work).result
+        self._answer = self._pool.submit(work)
         self._pool.shutdown(wait=False)  # the thread ends with its work, even if nobody asks for the answer
+
+    def result(self) -> T:
+        """The answer, or what the function raised; the caller's stream then waits for the thread's."""
+        answer = self._answer.result()
+        if self._stream is not None:
+            stream = torch.cuda.current_stream(self._stream.device)
+            if stream != self._stream:
+                stream.wait_stream(self._stream)
+                for tensor in tensors_of(answer):  # else their memory could be given away while they are read
+                    if tensor.is_cuda:
+                        tensor.record_stream(stream)
+            self._stream = None  # once is enough
+        return answer
 
     def close(self) -> None:
         """Wait until the thread has ended, whether its answer was asked for or not."""
         if self._pool is not None:
             self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+@functools.cache
+def _stream_beside(device: torch.device) -> torch.cuda.Stream:
+    """One stream for all, as memory that one stream has freed is not given to another."""
+    return torch.cuda.Stream(device)
+
+
+def tensors_of(value: object) -> Iterator[Tensor]:
+    """The tensors of a record, of its parts, and of what these have worked out and kept."""
+    if isinstance(value, Tensor):
+        yield value
+        return
+    if is_dataclass(value):
+        value = vars(value)
+    if isinstance(value, Mapping):
+        value = value.values()
+    if isinstance(value, (tuple, list, ValuesView)):
+        for part in value:
+            yield from tensors_of(part)

@@ -13,7 +13,7 @@ import torch
 
 from geodiff_plugin._checks import InputError, refuse
 from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin._threads import WithinCores
+from geodiff_plugin._threads import Beside, WithinCores
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.formats import recordings
@@ -144,7 +144,9 @@ class Stages:
         plain, kernels = torch.autocast(device.type, enabled=False), without_kernels(self._options.no_kernels)
         with pair.log.stage("evidence"), WithinCores(self._among), torch.no_grad(), plain, kernels:
             guidance.evidence_store = EvidenceStore(1, copies=False)
-            guidance.prepare(left_images(pair.inputs.left).to(device))
+            lefts_01 = left_images(pair.inputs.left).to(device)
+            # What it reads from a GPU does not wait for the pair before, which is still guided there.
+            Beside(lambda: guidance.prepare(lefts_01), device, own_stream=True).result()
         return pair
 
     def guide(self, pair: _OnItsWay) -> _OnItsWay:

@@ -48,6 +48,11 @@ class _Graph:
         return tuple(part.clone() for part in self._output)
 
 
+def _processor_of(module: torch.nn.Module) -> Any:
+    """What computes the attention of a layer, if it is one; ``getattr`` is slow where there is none."""
+    return vars(module).get("processor", module._modules.get("processor"))
+
+
 def _tensors(args: list[Any], kwargs: dict[str, Any]) -> list[Tensor]:
     return [value for value in (*args, *kwargs.values()) if isinstance(value, Tensor)]
 
@@ -71,7 +76,7 @@ class GraphedForward:
     def forget_if_changed(self) -> None:
         """Drop graphs that read other weights than the network now has, or run other layers."""
         weights = tuple(weight.data_ptr() for weight in self._network.parameters())
-        layers = tuple((id(m), id(getattr(m, "processor", None))) for m in self._network.modules())
+        layers = tuple((id(m), id(_processor_of(m))) for m in self._network.modules())
         if (weights, layers) != self._made_of:
             self._graphs.clear()
             self._made_of = weights, layers

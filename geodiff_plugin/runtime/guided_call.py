@@ -101,7 +101,7 @@ class GuidedCall(_Stock):
             with torch.inference_mode(False), torch.no_grad(), plain_torch, noted() as warned:
                 call = _bind(super().__call__, image, *args, **kwargs)
                 run, stock = self._call_guided(call, guidance, callback_on_step_end, held)
-                with torch.autocast(self._execution_device.type, enabled=False):
+                with torch.autocast(run.device.type, enabled=False):
                     output = run.output(stock, distinct(guidance.warned, warned))
         labelled = zip(image_labels(len(output.verdicts)), output.verdicts, strict=True)
         untrusted = " ".join(label + verdict.sentence for label, verdict in labelled if not verdict.trusted)
@@ -138,7 +138,7 @@ class GuidedCall(_Stock):
         call["image"] = lefts_01.contiguous(memory_format=layout)
         codec = MapCodec(self, prior, self._processing_grid(call, device), tiny)
         guidance.check_left_images(lefts_01)
-        evidence = Beside(lambda: _prepared(guidance, lefts_01), device)
+        evidence = Beside(lambda: _prepared(guidance, lefts_01), device, own_stream=True)
         try:
             if prior.takes_prompt and call.get("prompt_depth") is None:
                 call["prompt_depth"] = depth_prompt(evidence.result(), guidance.config)
@@ -146,7 +146,6 @@ class GuidedCall(_Stock):
             stock = self._run_stock(run, call)
         finally:
             evidence.close()
-        run.check_finite()
         return run, stock
 
     def _run_stock(self, run: GuidedRun, call: dict[str, Any]) -> Any:
@@ -166,6 +165,11 @@ class GuidedCall(_Stock):
         found = preprocess(call["image"], resolution, call["resample_method_input"], device)
         image, padding, _ = found
         return ProcessingGrid((image.shape[-2] - padding[0], image.shape[-1] - padding[1]), padding, found)
+
+    @property
+    def _execution_device(self) -> torch.device:
+        """As stock, which looks through all layers for it; while guided, where the run is."""
+        return super()._execution_device if self._guided_run is None else self._guided_run.device
 
     def progress_bar(self, iterable: Any = None, total: int | None = None, **kwargs: Any) -> Any:
         """Stock progress bars; while guided they are off, because the run shows one bar for all."""
@@ -288,7 +292,7 @@ def _check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) ->
 
 def _check_weights_stay(name: str, module: torch.nn.Module, differentiated: bool) -> None:
     """Refuse hooks that offload or cast weights before a backward pass needs them."""
-    registry, hook = getattr(module, "_diffusers_hook", None), getattr(module, "_hf_hook", None)
+    registry, hook = (vars(module).get(name) for name in ("_diffusers_hook", "_hf_hook"))
     of_diffusers = "" if registry is None else " ".join(registry.hooks)
     of_accelerate = [h for h in getattr(hook, "hooks", [hook]) if type(h).__name__ == "AlignDevicesHook"]
     if any(h.offload for h in of_accelerate) or "group_offloading" in of_diffusers:

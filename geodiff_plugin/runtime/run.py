@@ -51,6 +51,7 @@ class GuidedRun:
         callback: StepCallback | None = None,
     ) -> None:
         self.pipe, self.prior, self.config = codec.pipe, codec.prior, guidance.config
+        self.device: torch.device = call["image"].device
         self.guidance, self.call, self._evidence = guidance, call, evidence
         self._image_of_sample = [i for i in range(len(guidance.inputs)) for _ in range(call["ensemble_size"])]
         self.schedule: Schedule | None = None
@@ -135,8 +136,12 @@ class GuidedRun:
         )
         spreads = [None] * count if stock.uncertainty is None else stock.uncertainty.split(1)
         of_images = zip(self._evidence(), members, stock.prediction.split(1), spreads, strict=True)
+        try:
+            results = [finish(*of_image, options) for of_image in of_images]
+        finally:  # also where it fails on what is not finite
+            self.check_finite()
         return stack_results(
-            [finish(*of_image, options) for of_image in of_images],
+            results,
             guidance,
             [report for trajectory in self.trajectories for report in trajectory.history],
             remarks=[message for message in warned if not message.forbids_trust],  # others are reasons
@@ -145,7 +150,10 @@ class GuidedRun:
         )
 
     def check_finite(self) -> None:
-        """Raise ``InputError`` on the first tensor of the loop that was not finite; once, after the loop."""
+        """Raise ``InputError`` on the first tensor of the loop that was not finite.
+
+        Once, after all has been asked of the device: reading it earlier would wait for the network.
+        """
         for trajectory in self.trajectories:
             trajectory.watch.check(self.pipe.dtype)
 
