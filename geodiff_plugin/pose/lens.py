@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from geodiff_plugin.pose.tracks import FEWEST, Tracks, across_lines, blocks, residuals_px
+from geodiff_plugin.pose.tracks import FEWEST, TINY, Tracks, blocks, epipolar
 
 #: Matches further off their epipolar lines than this are wrong, pixels.
 MOST_OFF_PX = 12.0
@@ -21,16 +22,32 @@ MOST_K1 = 0.6
 UNCERTAIN = 4.0
 
 
-def _without(px: np.ndarray, K: np.ndarray, k1: float) -> np.ndarray:
-    """Pixels ``(N, 2)`` of a picture from which a distortion ``k1`` is removed."""
-    return cv2.undistortPoints(px[:, None], K, np.array([k1, 0.0, 0.0, 0.0]), P=K)[:, 0]
+class _Pair(NamedTuple):
+    """Matches as rays with z = 1, bent as their pictures are, and what the true rays give.
+
+    The true left ray ``x`` and right ray ``y`` meet where ``y . m = 0`` with ``m = R x x t``.
+    """
+
+    bent: np.ndarray  # (2 N, 1, 2) the left rays, then the right ones
+    lines: np.ndarray  # (5, 3) times x: m, then the normal of the line in pixels
 
 
-def _residuals(tracks: Tracks, T: np.ndarray, k1: float) -> np.ndarray:
-    """Signed distances ``(N,)`` from the epipolar lines without a distortion of both pictures, pixels."""
-    left_px = _without(tracks.left_px, tracks.K_left, k1)
-    right_px = _without(tracks.right_px[0], tracks.K_rights[0], k1)
-    return across_lines(replace(tracks, left_px=left_px, right_px=right_px[None]), T)[0]
+def _pair(tracks: Tracks, T: np.ndarray) -> _Pair:
+    right = np.c_[tracks.right_px[0], np.ones(len(tracks))] @ np.linalg.inv(tracks.K_rights[0]).T
+    tx, ty, tz = T[:3, 3]
+    m = np.array([[0.0, tz, -ty], [-tz, 0.0, tx], [ty, -tx, 0.0]]) @ T[:3, :3]
+    normals = np.linalg.inv(tracks.K_rights[0])[:, :2].T @ m
+    return _Pair(np.concatenate([tracks.rays, right])[:, None, :2], np.concatenate([m, normals]))
+
+
+def _residuals(pair: _Pair, k1s: Sequence[float]) -> np.ndarray:
+    """Signed distances ``(len(k1s), N)`` from the epipolar lines without these distortions, pixels."""
+    K = np.eye(3)
+    straight = np.stack([cv2.undistortPoints(pair.bent, K, np.array([k1, 0, 0, 0])) for k1 in k1s])
+    left, right = np.split(straight[:, :, 0], 2, axis=1)
+    of_left = left @ pair.lines[:, :2].T + pair.lines[:, 2]  # (len(k1s), N, 5)
+    off = (of_left[..., :2] * right).sum(-1) + of_left[..., 2]
+    return off / np.maximum(np.hypot(of_left[..., 3], of_left[..., 4]), TINY)
 
 
 def remaining_distortion(tracks: Tracks, T: np.ndarray) -> float:
@@ -49,18 +66,20 @@ def remaining_distortion(tracks: Tracks, T: np.ndarray) -> float:
     Returns:
         ``k1``; 0 where nothing is certain, NaN for too few matches.
     """
-    tracks = tracks.kept(residuals_px(tracks, T[None])[0] < MOST_OFF_PX)
+    tracks = tracks.kept(np.abs(epipolar(tracks, T).off_px) < MOST_OFF_PX)
     if len(tracks) < FEWEST:
         return float("nan")
-    k1 = 0.0
+    pair, k1 = _pair(tracks, T), 0.0
+    A = np.ones((len(tracks), 2))  # derivative of the residuals by k1 and by the shift
     for _ in range(STEPS):
-        off = _residuals(tracks, T, k1)
-        ahead, behind = (_residuals(tracks, T, k1 + way * STEP_K1) for way in (1, -1))
-        A = np.c_[(ahead - behind) / (2 * STEP_K1), np.ones(len(tracks))]
-        scale = max(1.4826 * float(np.median(np.abs(off - np.median(off)))), 0.1)
-        weight = 1.0 / (1.0 + ((off - np.median(off)) / (2.0 * scale)) ** 2)
-        H = (A * weight[:, None]).T @ A + 1e-9 * np.eye(2)
-        step = np.linalg.solve(H, (A * weight[:, None]).T @ off)
+        off, ahead, behind = _residuals(pair, (k1, k1 + STEP_K1, k1 - STEP_K1))
+        A[:, 0] = (ahead - behind) / (2 * STEP_K1)
+        centred = off - np.median(off)
+        scale = max(1.4826 * float(np.median(np.abs(centred))), 0.1)
+        weight = 1.0 / (1.0 + (centred / (2.0 * scale)) ** 2)
+        weighted = A * weight[:, None]
+        H = weighted.T @ A + 1e-9 * np.eye(2)
+        step = np.linalg.solve(H, weighted.T @ off)
         k1 = float(np.clip(k1 - step[0], -MOST_K1, MOST_K1))
     inverse, pulls = np.linalg.inv(H), A * (weight * (off - A @ step))[:, None]
     error = max(scale * float(np.sqrt(inverse[0, 0])), _error_by_blocks(inverse, pulls, blocks(tracks)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.messages import Message
-from geodiff_plugin.pose.tracks import Tracks, residuals_px, solve_inverse_depth
+from geodiff_plugin.pose.tracks import Tracks, epipolar
 
 INVERSE = Message(
     "pose.inverse",
@@ -78,9 +78,9 @@ class _Candidate(NamedTuple):
 
 
 def _fit(tracks: Tracks, T: np.ndarray) -> _Fit:
-    inverse_depth = solve_inverse_depth(tracks, T[None])
-    ahead = (inverse_depth > 0) & ((tracks.rays @ T[2, :3] + inverse_depth * T[2, 3]) > 0)
-    off_px = residuals_px(tracks, T[None])[0]
+    at = epipolar(tracks, T)
+    ahead = (at.inverse_depth > 0) & ((tracks.rays @ T[2, :3] + at.inverse_depth * T[2, 3]) > 0)
+    off_px = np.abs(at.off_px)
     shares = tuple(float((ahead & (off_px < near_px)).mean()) for near_px in _NEAR_PX)
     return _Fit(shares, float(np.median(off_px)))
 

@@ -21,10 +21,10 @@ from geodiff_plugin.pose.solve import is_rig, nearby_poses, settle_poses
 from geodiff_plugin.pose.tracks import (
     FEWEST,
     Tracks,
-    across_lines,
     behind_infinity,
     coarse_depth,
     dense_tracks,
+    epipolar,
     grey_views,
     median_residuals,
     merge_tracks,
@@ -269,7 +269,7 @@ def fit_displacement(tracks: Tracks, T: np.ndarray, size: tuple[int, int]) -> Di
     """
     if len(tracks) < _FEWEST_BENT:
         return None
-    off, normals = across_lines(tracks, T)
+    off, normals, _ = epipolar(tracks, T)
     basis = _cubic(tracks.right_px[0], size)
     block = (tracks.left_px // (_BLOCK * max(size))).sum(1) % 2 == 0
     predicted = np.empty(len(off))

@@ -57,7 +57,8 @@ _ON_LINE_PX = 2.0
 _BEHIND_PX = 1.0
 #: How far matches lie behind infinity is measured at this quantile of all: of right pairs at most 2 % do.
 _FARTHEST_BEHIND = 0.97
-_TINY = 1e-12
+#: Least divisor.
+TINY = 1e-12
 #: A grey image ``(H, W)`` uint8 and its K ``(3, 3)`` float64.
 GreyImage = tuple[np.ndarray, np.ndarray]
 
@@ -92,7 +93,11 @@ class Tracks:
 
     def view(self, v: int) -> Tracks:
         """The tracks that right view ``v`` sees, of that view alone."""
-        return self.alone(v).kept(self.seen[v])
+        return self._views[v]
+
+    @cached_property
+    def _views(self) -> tuple[Tracks, ...]:
+        return tuple(self.alone(v).kept(seen) for v, seen in enumerate(self.seen))
 
     def seen_anywhere(self) -> Tracks:
         """The tracks that at least one right view sees."""
@@ -134,6 +139,37 @@ def project_tracks(rays: np.ndarray, inverse_depth: np.ndarray, K: np.ndarray, T
     return Projected(px, scaled, by_point, by_point @ T[:3, 3])
 
 
+class Epipolar(NamedTuple):
+    """Tracks of one right view, and the points of their epipolar lines that are nearest to the matches."""
+
+    off_px: np.ndarray  # (N,) from the matches to these points, positive along the normals
+    normals: np.ndarray  # (N, 2) of the lines
+    inverse_depth: np.ndarray  # (N,) 1/m of these points, negative where rays diverge
+
+
+def epipolar(tracks: Tracks, T: np.ndarray) -> Epipolar:
+    """The least reprojection error of tracks of one right view, in closed form.
+
+    At inverse depth w a left ray x projects to ``a + w b`` with ``a = K R x`` and ``b = K t``, a point of the
+    line ``a x b``; of these the one nearest to the match is taken. Where ``a`` and ``b`` are parallel, the
+    line is a point, and all values are 0.
+
+    Args:
+        tracks: of one right view; where it does not see a track, the values mean nothing.
+        T: ``(4, 4)`` ``T_right_from_left``.
+    """
+    A, b = tracks.K_rights[0] @ T[:3, :3], tracks.K_rights[0] @ T[:3, 3]
+    across_b = np.array([[0.0, b[2], -b[1]], [-b[2], 0.0, b[0]]])  # of a x b, the normal of the line
+    ax, ay, az, nx, ny = np.concatenate([A, across_b @ A]) @ tracks.rays.T
+    length = np.maximum(np.hypot(nx, ny), TINY)
+    nx, ny = nx / length, ny / length
+    x, y = tracks.right_px[0].T
+    cx, cy, dx, dy = ax - x * az, ay - y * az, b[0] - x * b[2], b[1] - y * b[2]  # a and b from the match
+    along_c, along_d = ny * cx - nx * cy, ny * dx - nx * dy
+    inverse_depth = -along_c * along_d / np.maximum(along_d**2, TINY)
+    return Epipolar((cy * dx - cx * dy) / length, np.stack([nx, ny], axis=1), inverse_depth)
+
+
 def _linear_inverse_depth(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
     """The inverse depth with the least algebraic error, ``(N,)``."""
     above, below = np.zeros(len(tracks)), np.zeros(len(tracks))
@@ -143,18 +179,21 @@ def _linear_inverse_depth(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
         d = b[:2] - right_px * b[2]
         above -= np.where(seen, (c * d).sum(1), 0.0)
         below += np.where(seen, (d * d).sum(1), 0.0)
-    return above / np.maximum(below, _TINY)
+    return above / np.maximum(below, TINY)
 
 
 def solve_inverse_depth(tracks: Tracks, Ts: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """The inverse depth ``(N,)`` 1/m of every track that fits its right pixels best, by Gauss and Newton.
+    """The inverse depth ``(N,)`` 1/m of every track that fits its right pixels best.
 
     ``Ts (V, 4, 4)`` are ``T_right_from_left``, ``weights (V, N)``; the result is negative where rays diverge.
+    With one right view it has a closed form, with more Gauss-Newton finds it.
     """
+    if len(Ts) == 1:
+        return np.where(tracks.seen[0], epipolar(tracks, Ts[0]).inverse_depth, 0.0)
     weights = tracks.seen.astype(float) if weights is None else weights * tracks.seen
     inverse_depth = _linear_inverse_depth(tracks, Ts)
     for _ in range(3):
-        above, below = np.zeros(len(tracks)), np.full(len(tracks), _TINY)
+        above, below = np.zeros(len(tracks)), np.full(len(tracks), TINY)
         for v, T in enumerate(Ts):
             at = project_tracks(tracks.rays, inverse_depth, tracks.K_rights[v], T)
             off = tracks.right_px[v] - at.px
@@ -169,6 +208,8 @@ def residuals_px(tracks: Tracks, Ts: np.ndarray) -> np.ndarray:
 
     ``(V, N)`` pixels of the right views; with one right view it is the distance from the epipolar line.
     """
+    if len(Ts) == 1:
+        return np.where(tracks.seen, np.abs(epipolar(tracks, Ts[0]).off_px), np.nan)
     inverse_depth = solve_inverse_depth(tracks, Ts)
     off = [
         np.linalg.norm(project_tracks(tracks.rays, inverse_depth, K, T).px - px, axis=1)
@@ -206,25 +247,16 @@ def behind_infinity(tracks: Tracks, Ts: np.ndarray) -> Behind:
     beyond_px = []
     for v, T in enumerate(Ts):
         seen = tracks.view(v)
-        seen = seen.kept(residuals_px(seen, T[None])[0] < _ON_LINE_PX)
-        inverse_depth = solve_inverse_depth(seen, T[None])
-        far, at = (
-            project_tracks(seen.rays, w, seen.K_rights[0], T).px for w in (np.zeros(len(seen)), inverse_depth)
-        )
-        away_px = np.linalg.norm(at - far, axis=1)
-        beyond_px.append(np.where((inverse_depth < 0) & (away_px > _BEHIND_PX), away_px, 0.0))
+        at = epipolar(seen, T)
+        far = project_tracks(seen.rays, np.zeros(len(seen)), seen.K_rights[0], T).px
+        nearest = seen.right_px[0] + at.off_px[:, None] * at.normals
+        away_px = np.hypot(*(nearest - far).T)
+        behind = (at.inverse_depth < 0) & (away_px > _BEHIND_PX)
+        beyond_px.append(np.where(behind, away_px, 0.0)[np.abs(at.off_px) < _ON_LINE_PX])
     every_px = np.concatenate(beyond_px)
     if len(every_px) < FEWEST:
         return Behind(math.nan, math.nan)
     return Behind(float((every_px > 0).mean()), float(np.quantile(every_px, _FARTHEST_BEHIND)))
-
-
-def across_lines(tracks: Tracks, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Signed residuals ``(N,)`` across a right view's epipolar lines, and the lines' normals ``(N, 2)``."""
-    at = project_tracks(tracks.rays, solve_inverse_depth(tracks, T[None]), tracks.K_rights[0], T)
-    along = at.by_inverse_depth / np.maximum(np.linalg.norm(at.by_inverse_depth, axis=1, keepdims=True), 1e-9)
-    normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    return ((at.px - tracks.right_px[0]) * normals).sum(1), normals
 
 
 def split_residuals(tracks: Tracks, T: np.ndarray) -> tuple[float, float]:
@@ -234,7 +266,7 @@ def split_residuals(tracks: Tracks, T: np.ndarray) -> tuple[float, float]:
     matches determine a pose no better than a few. The means of blocks of the image show them: the mean of
     ``n`` independent residuals has ``1 / n`` of their variance. ``T (4, 4)`` fits tracks of one right view.
     """
-    off, _ = across_lines(tracks, T)
+    off = epipolar(tracks, T).off_px
     scale = max(1.4826 * float(np.median(np.abs(off))), 1e-3)
     kept = np.abs(off) < 3.0 * scale
     block = blocks(tracks.kept(kept))

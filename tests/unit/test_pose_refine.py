@@ -20,7 +20,9 @@ from geodiff_plugin.pose.solve import PosePrior, is_rig, settle_poses, solve_pos
 from geodiff_plugin.pose.tracks import (
     Tracks,
     behind_infinity,
+    epipolar,
     median_residuals,
+    project_tracks,
     residuals_px,
     solve_inverse_depth,
 )
@@ -80,7 +82,23 @@ def test_residual_is_the_distance_from_the_epipolar_line() -> None:
     lines = np.c_[tracks.left_px, np.ones(len(tracks))] @ F.T
     places = np.c_[tracks.right_px[0], np.ones(len(tracks))]
     distance = np.abs((lines * places).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
-    assert np.allclose(residuals_px(tracks, Ts)[0], distance, atol=1e-3)
+    assert np.allclose(residuals_px(tracks, Ts)[0], distance, atol=1e-9)
+
+
+def test_with_one_right_view_a_track_lies_where_its_line_is_nearest_to_the_match() -> None:
+    tracks, Ts, depth_m = make_tracks([TRUE], noise_px=1.0, outliers=0.0, count=60)
+    skewed = tracks.K_rights + [[0.0, 3.0, 0.0], [0.0, -20.0, 0.0], [0.0, 0.0, 0.0]]
+    tracks = replace(tracks, K_rights=skewed, right_px=tracks.right_px + [1.0, -4.0])
+    at = epipolar(tracks, Ts[0])
+    nearest = tracks.right_px[0] + at.off_px[:, None] * at.normals
+    for i, (ray, match) in enumerate(zip(tracks.rays, tracks.right_px[0], strict=True)):
+
+        def away_px(w: float, ray: np.ndarray = ray, match: np.ndarray = match) -> np.ndarray:
+            return project_tracks(ray[None], np.array([w]), skewed[0], Ts[0]).px[0] - match
+
+        found = least_squares(lambda w: away_px(w[0]), 1.0 / depth_m[i], x_scale=0.01, xtol=1e-14)
+        assert solve_inverse_depth(tracks, Ts)[i] == pytest.approx(found.x[0], abs=1e-6)
+        assert nearest[i] - match == pytest.approx(away_px(found.x[0]), abs=1e-4)
 
 
 def test_a_perturbed_pose_comes_back_but_for_what_the_views_cannot_tell() -> None:
