@@ -475,6 +475,11 @@ MESSAGES: dict[str, MessageKind] = {
         cause="It has several models, splits or cameras, of which one is taken.",
         cure="Name the file or folder of another one to take that.",
     ),
+    "capture.images-found": MessageKind(
+        "Images were found elsewhere than the file of cameras says",
+        cause="They lie in none of the usual folders; files of their names lie near it.",
+        cure="Check that they are the right ones; if not, give their folder (--images).",
+    ),
     "capture.gps-scale": MessageKind(
         "The capture was aligned with GPS",
         cause="OpenSfM fitted its reconstruction to positions that are exact to some metres.",

@@ -78,17 +78,19 @@ class Capture:
         K: np.ndarray | None = None,
         fov: float | None = None,
         trajectory: str | os.PathLike[str] | None = None,
+        images: str | os.PathLike[str] | None = None,
     ) -> Self:
         """Read a capture, a file or folder whose layout is recognised (docs/how-to/captures.md lists them).
 
         Where it has no intrinsics they are ``K (3, 3)`` pixels, or by a horizontal field of view in degrees;
-        ``trajectory`` is of a video, in TUM's form.
+        ``trajectory`` is of a video, in TUM's form. ``images`` is the folder of the images that a file of
+        cameras names, where they lie neither beside it nor near it, or in several copies.
 
         Raises:
             FileNotFoundError: nothing there.
             InputError: nothing that is a capture, or fewer than two frames.
         """
-        return cls(*read_capture(path, K=K, fov=fov, trajectory=trajectory))
+        return cls(*read_capture(path, K=K, fov=fov, trajectory=trajectory, images=images))
 
     def __len__(self) -> int:
         return len(self.names)

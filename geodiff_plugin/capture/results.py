@@ -20,7 +20,7 @@ from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb, write
 from geodiff_plugin.formats.colmap import write_colmap
 from geodiff_plugin.formats.depth import write_depth_mm, write_depth_npy
 from geodiff_plugin.formats.out import REPORT, atomic_path, files_of_report, write_text
-from geodiff_plugin.formats.transforms import TRANSFORMS, transforms_of
+from geodiff_plugin.formats.transforms import TransformsFile
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.multiview import Observations
 from geodiff_plugin.types import DepthFrame
@@ -140,11 +140,11 @@ def write_results(
     names: Sequence[str],
     export: Sequence[str],
     doubted: Sequence[str],
-    source: Path,
+    original: TransformsFile | None,
 ) -> dict[str, Any]:
     """Write, after ``write_agreement``, clouds, a sheet that marks ``doubted`` frames, ``export``; counts.
 
-    ``source`` is the path of the capture.
+    ``original`` is the transforms.json that the capture was read from.
     """
     unsure = set(doubted) if len(doubted) < len(names) else set()  # of these only what another frame confirms
 
@@ -164,7 +164,6 @@ def write_results(
         seen = [solved.seen[capture.names.index(name)] for name in names]
         write_workspace(out / "colmap", map(load, names), capture.image, solved.points, seen)
     if "nerfstudio" in export:
-        original = transforms_of(source) if capture.kind == TRANSFORMS else None
         write_splats(out / "nerfstudio", capture, names, lambda name: _sure(load(name)), cloud, original)
     _sheet(capture, out, names, doubted)
     _video(capture, out, names)

@@ -51,8 +51,8 @@ MOST_REASONS = 3
 
 #: Every layout; the first that recognises a path reads it.
 LAYOUTS = (
-    CaptureFormat("a transforms.json", ("transforms*.json",), read_transforms),
-    CaptureFormat("a COLMAP model", ("**/cameras.*", "**/images.*"), read_colmap_capture),
+    CaptureFormat("a transforms.json", ("transforms*.json",), read_transforms, names_images=True),
+    CaptureFormat("a COLMAP model", ("**/cameras.*", "**/images.*"), read_colmap_capture, names_images=True),
     CaptureFormat("Polycam's raw data", ("keyframes/*cameras", "keyframes/*images"), read_polycam),
     CaptureFormat("Record3D", ("metadata.json", "rgb"), read_record3d),
     CaptureFormat("Stray Scanner", ("odometry.csv", "camera_matrix.csv", "rgb.mp4"), read_stray),
@@ -64,10 +64,10 @@ LAYOUTS = (
     CaptureFormat("TartanAir", ("image_left", "pose_left.txt"), read_tartanair),
     CaptureFormat("KITTI odometry", ("image_[0-3]", "calib.txt", "poses.txt"), read_kitti_odometry),
     CaptureFormat("MVSNet", ("cams/*_cam.txt", "*images"), read_mvsnet_folder),
-    CaptureFormat("Metashape", ("*.xml",), read_metashape),
-    CaptureFormat("OpenSfM", ("*reconstruction*.json",), read_opensfm),
-    CaptureFormat("Bundler", ("*.out", "list*.txt"), read_bundler),
-    CaptureFormat("VisualSFM", ("*.nvm",), read_nvm),
+    CaptureFormat("Metashape", ("*.xml",), read_metashape, names_images=True),
+    CaptureFormat("OpenSfM", ("*reconstruction*.json",), read_opensfm, names_images=True),
+    CaptureFormat("Bundler", ("*.out", "list*.txt"), read_bundler, names_images=True),
+    CaptureFormat("VisualSFM", ("*.nvm",), read_nvm, names_images=True),
     CaptureFormat("Tanks and Temples", ("*.log",), read_log),
     CaptureFormat("a video", ("*.mp4",), read_video),
     CaptureFormat("images", ("*.jpg",), read_photographs),
@@ -88,17 +88,19 @@ def read_capture(
     K: np.ndarray | None = None,
     fov: float | None = None,
     trajectory: PathLike | None = None,
+    images: PathLike | None = None,
 ) -> tuple[list[CaptureFrame], str, str | None, list[Message]]:
     """The frames of a capture in order, the kind of its layout, its unit, and notes for the user.
 
     ``K`` and ``fov`` (horizontal, degrees) are for layouts without intrinsics, and go before the files'.
     ``trajectory`` has a video's lines ``seconds tx ty tz qx qy qz qw``, camera-to-world, OpenCV's axes.
+    ``images`` is the folder in or below which the images lie that a file of cameras names.
     """
     source = Path(path)
     if not os.path.exists(source):
         bad_value("PATH", "a capture", f"{source}, which does not exist", error=MissingFileError)
     with reading_whole(source, "capture"):
-        layout = _layout(source, None if trajectory is None else Path(trajectory))
+        layout = _layout(source, *(None if path is None else Path(path) for path in (trajectory, images)))
         typed = TypedCamera(K, fov)
         finished = [_finished(candidate, layout.as_stored, typed) for candidate in layout.candidates]
     tracked = any(each.frame.E is not None and not each.problem for each in finished)
@@ -116,7 +118,7 @@ def read_capture(
     return frames, layout.kind, layout.unit if tracked else None, notes
 
 
-def _layout(source: Path, trajectory: Path | None) -> Layout:
+def _layout(source: Path, trajectory: Path | None, images: Path | None) -> Layout:
     """What the first reader that recognises a path finds there."""
     if trajectory is not None:
         layout = read_video(source, trajectory)
@@ -124,9 +126,15 @@ def _layout(source: Path, trajectory: Path | None) -> Layout:
             bad_value("trajectory (--trajectory)", "left out where the capture is not a video", trajectory)
         return layout
     refuse_foreign(source)
-    found = (layout.read(source) for layout in LAYOUTS)
-    layout = next((each for each in found if each is not None), None)
-    return layout or refuse_unknown(source, LAYOUTS)
+    for each in LAYOUTS:
+        layout = each.read(source, images) if each.names_images else each.read(source)
+        if layout is None:
+            continue
+        if images is not None and not each.names_images:
+            expected = "left out where no file names the images"
+            bad_value("images (--images)", expected, f"{images} for {each.summary}")
+        return layout
+    refuse_unknown(source, LAYOUTS)
 
 
 def _left_out(candidate: Candidate, problem: str) -> Candidate:

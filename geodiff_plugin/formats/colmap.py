@@ -23,7 +23,8 @@ from scipy.spatial.transform import Rotation
 from geodiff_plugin._checks import InputError, MissingFileError, bad_value
 from geodiff_plugin.formats.clouds import Cloud
 from geodiff_plugin.formats.files import PathLike, check_file, read_text
-from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout, image_folders
+from geodiff_plugin.formats.image_files import image_folders
+from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout
 from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.formats.rigs import (
     Camera,
@@ -311,8 +312,8 @@ def _around(folder: Path, project: Path) -> list[Path]:
     return [at for at in above if at.is_relative_to(project)] if inside else above
 
 
-def read_colmap_capture(path: Path) -> Layout | None:
-    """A model (text or binary), or the project that holds one."""
+def read_colmap_capture(path: Path, images_at: Path | None = None) -> Layout | None:
+    """A model (text or binary), or the project that holds one; its images may be given by their folder."""
     models = _models_below(path)
     if not models:
         return None
@@ -322,14 +323,14 @@ def read_colmap_capture(path: Path) -> Layout | None:
         seen = read_points(folder)
     except MissingFileError:
         seen = {}
-    images = Images(sorted(model.images), image_folders(*_around(folder, path)), path)
+    images = Images(sorted(model.images), image_folders(*_around(folder, path)), path, images_at)
 
     def build(frame: CaptureFrame, image: PosedImage) -> Candidate:
         posed = replace(frame, E=np.linalg.inv(image.T), points=seen.get(image.number))
         return Candidate(posed, model.camera(image.camera))
 
     candidates = [images.candidate(name, partial(build, image=model.images[name])) for name in images.names]
-    return Layout("COLMAP model", None, candidates, as_stored=True, notes=notes)
+    return Layout("COLMAP model", None, candidates, as_stored=True, notes=(*notes, *images.notes))
 
 
 def check_colmap_names(names: Sequence[str]) -> None:

@@ -17,12 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.files import read_rows, read_text
+from geodiff_plugin.formats.image_files import images_in
 from geodiff_plugin.formats.layouts import (
     Candidate,
     CaptureFrame,
     Layout,
     build_frame,
-    images_in,
 )
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, pose_of, rigid
 from geodiff_plugin.formats.robotics import body_from_camera, euroc_camera

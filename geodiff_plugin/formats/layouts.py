@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin._checks import InputError
-from geodiff_plugin.formats.files import natural_order
+from geodiff_plugin._checks import InputError, bad_value
+from geodiff_plugin.formats.image_files import LEVELS_UP, find_images, find_moved
 from geodiff_plugin.formats.rigs import Camera
 from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Distortion
 
-IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic")
-#: Folders beside a file of cameras in which its images lie, smaller copies last.
-IMAGE_FOLDERS = ("images", "input", "images_2", "images_4", "images_8")
 #: Why a frame without its photograph is left out.
 NO_IMAGE = "no image file"
 #: Why a frame that was not placed is left out.
@@ -74,28 +71,14 @@ class CaptureFormat:
     """One line of ``LAYOUTS``: ``read`` returns ``None`` for a path that is none of this format.
 
     ``marks`` are patterns of the files and folders by which it is recognised; where nothing is, they say
-    which format comes nearest.
+    which format comes nearest. ``names_images``: its file names images that may lie anywhere; then ``read``
+    also takes the folder that the user gives for them, or ``None``.
     """
 
     summary: str
     marks: tuple[str, ...]
-    read: Callable[[Path], Layout | None]
-
-
-def images_of(paths: Iterable[Path]) -> list[Path]:
-    """The images among paths, numbers in names in order."""
-    return sorted((path for path in paths if path.suffix.lower() in IMAGES), key=natural_order)
-
-
-def images_in(folder: Path) -> list[Path]:
-    """The images of a folder, numbers in names in order; none where there is no folder."""
-    return images_of(folder.iterdir()) if os.path.isdir(folder) else []
-
-
-def image_folders(*folders: Path) -> list[Path]:
-    """Every folder, and those below it that usually hold images."""
-    every = [at for folder in folders for at in (folder, *(folder / name for name in IMAGE_FOLDERS))]
-    return [folder for folder in dict.fromkeys(every) if folder.is_dir()]
+    read: Callable[..., Layout | None]
+    names_images: bool = False
 
 
 def build_frame(frame: CaptureFrame, build: Callable[[CaptureFrame], Candidate]) -> Candidate:
@@ -109,16 +92,38 @@ def build_frame(frame: CaptureFrame, build: Callable[[CaptureFrame], Candidate])
 
 
 class Images:
-    """The images that a file of cameras names, looked for in ``folders`` of a ``project``."""
+    """The images that a file of cameras names.
 
-    def __init__(self, names: Sequence[str], folders: Sequence[Path], project: Path) -> None:
-        self.names = list(names)
+    They are looked for in ``folders`` of a ``project``, the first of which is that of the file, and where
+    none of them is there, anywhere near it, but not in folders that are called like one of ``other``. Where
+    ``given`` is a folder, they are looked for in and below that alone. ``notes`` say where they were found.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        folders: Sequence[Path],
+        project: Path,
+        given: Path | None = None,
+        other: Sequence[str] = (),
+    ) -> None:
+        self.names, self.notes = list(names), tuple[Message, ...]()
         once = list(dict.fromkeys(names))
-        self._files = dict(zip(once, find_images(once, folders), strict=True))
-        below = project if project.is_dir() else project.parent
+        folders = folders if given is None else [_folder_of_images(given)]
+        files, below = find_images(once, folders), project if project.is_dir() else project.parent
         places = [os.path.relpath(folder, below) for folder in folders]
-        self._used = set[str]()
-        self._searched = ", ".join("its folder" if at == "." else at for at in places) or "any folder"
+        searched = ", ".join("its folder" if at == "." else at for at in places)
+        self._problem = f"{NO_IMAGE} in {searched}"
+        if once and not any(files):
+            levels = LEVELS_UP if given is None else 0
+            moved = find_moved(once, folders[0], levels, other)
+            if moved is None:
+                self._problem += " or elsewhere near it: say where they lie (--images)"
+            else:
+                files, at = moved.files, os.path.relpath(moved.below, below)
+                sentence = f"The images are those below {at}, since there is none in {searched}."
+                self.notes = (Message("capture.images-found", sentence),) if given is None else ()
+        self._files, self._used = dict(zip(once, files, strict=True)), set[str]()
 
     def file(self, name: str) -> Path | None:
         """The image of a name, if there is one."""
@@ -131,64 +136,15 @@ class Images:
         if file is not None and not twice:
             return build_frame(CaptureFrame(file.stem, file), build)
         missing = Path(name.replace("\\", "/"))
-        problem = "named twice; the first is used" if twice else f"{NO_IMAGE} in {self._searched}"
+        problem = "named twice; the first is used" if twice else self._problem
         return Candidate(CaptureFrame(missing.name, missing), None, problem)
 
 
-def find_images(names: Sequence[str], folders: Sequence[Path]) -> list[Path | None]:
-    """The file of each name: whole below a folder, else by its last parts, else of another suffix.
-
-    Names may be of Windows, absolute on another machine, or older than a change of suffix. A file that two
-    names could mean belongs to the one that names it in full, else to none of them.
-    """
-    finder = _Finder(folders)
-    found = [finder.find(name) for name in names]
-    claims: dict[Path, list[bool]] = {}
-    for path, exact in found:
-        if path is not None:
-            claims.setdefault(path, []).append(exact)
-    files: list[Path | None] = []
-    for path, exact in found:
-        alone = path is not None and (exact or len(claims[path]) == 1)
-        files.append(path if alone else None)
-    return files
-
-
-class _Finder:
-    """Looks names up in folders, each of which is listed once."""
-
-    def __init__(self, folders: Sequence[Path]) -> None:
-        self._folders = list(folders)
-        self._by_stem: dict[Path, dict[str, list[Path]]] = {}
-
-    def find(self, name: str) -> tuple[Path | None, bool]:
-        """The file of a name, and whether the name says all of its path below a folder."""
-        parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", ".")]
-        parts = parts[1:] if parts and parts[0].endswith(":") else parts
-        for start in range(len(parts)):
-            for folder in self._folders:
-                path = folder.joinpath(*parts[start:])
-                if os.path.isfile(path) and path.suffix.lower() in IMAGES:
-                    return path, start == 0
-            for folder in self._folders:
-                alike = self._stems(folder.joinpath(*parts[start:-1])).get(_stem(parts[-1]), [])
-                if len(alike) == 1:
-                    return alike[0], False
-        return None, False
-
-    def _stems(self, folder: Path) -> dict[str, list[Path]]:
-        if folder not in self._by_stem:
-            stems: dict[str, list[Path]] = {}
-            for path in images_in(folder):
-                stems.setdefault(_stem(path.name), []).append(path)
-            self._by_stem[folder] = stems
-        return self._by_stem[folder]
-
-
-def _stem(name: str) -> str:
-    """A name without the suffix of an image, in small letters; NeRF's names have none."""
-    path = PurePosixPath(name)
-    return (path.stem if path.suffix.lower() in IMAGES else name).lower()
+def _folder_of_images(given: Path) -> Path:
+    if not given.is_dir():
+        cure = "Give the folder that holds the images, or folders of them."
+        bad_value("images (--images)", "a folder", f"{given}, which is none", cure)
+    return given
 
 
 def _folder_name(name: str) -> str:

@@ -15,7 +15,8 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin.formats.files import read_matrix, read_rows, read_text
-from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Layout, build_frame, images_in
+from geodiff_plugin.formats.image_files import images_in
+from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Layout, build_frame
 from geodiff_plugin.formats.recordings import video_facts
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, pose_of, rigid
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV

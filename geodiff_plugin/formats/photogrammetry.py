@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.formats.files import check_file, parse_xml, read_text, stored_size
-from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout, image_folders
+from geodiff_plugin.formats.image_files import image_folders
+from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, pose_of, rigid
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.messages import Message
@@ -54,16 +55,16 @@ def _files(path: Path, *patterns: str) -> Iterator[Path]:
 # Metashape
 
 
-def read_metashape(path: Path) -> Layout | None:
+def read_metashape(path: Path, images_at: Path | None = None) -> Layout | None:
     """Metashape's ``cameras.xml``: camera-to-world poses, in metres where the chunk has a scale."""
     for file in _files(path, "*.xml"):
         text = read_text(file, "PATH")
         if "<chunk" in text and "<camera" in text:
-            return _metashape(file, parse_xml(text))
+            return _metashape(file, parse_xml(text), images_at)
     return None
 
 
-def _metashape(file: Path, root: Element) -> Layout:
+def _metashape(file: Path, root: Element, images_at: Path | None) -> Layout:
     sensors: dict[str | None, Camera | str] = {}
     for sensor in root.iter("sensor"):
         try:
@@ -72,7 +73,8 @@ def _metashape(file: Path, root: Element) -> Layout:
             sensors[sensor.get("id")] = str(error)
     scale = next((float(node.text or 1) for node in root.iter("scale")), 1.0)
     cameras = [camera for camera in root.iter("camera") if camera.get("label")]
-    images = Images([str(camera.get("label")) for camera in cameras], image_folders(file.parent), file)
+    labels = [str(camera.get("label")) for camera in cameras]
+    images = Images(labels, image_folders(file.parent), file, images_at)
 
     def build(frame: CaptureFrame, camera: Element) -> Candidate:
         sensor = sensors.get(camera.get("sensor_id"), "its sensor is not in the file")
@@ -87,7 +89,7 @@ def _metashape(file: Path, root: Element) -> Layout:
 
     pairs = zip(images.names, cameras, strict=True)
     candidates = [images.candidate(name, partial(build, camera=camera)) for name, camera in pairs]
-    return Layout("Metashape", None if scale == 1.0 else "m", candidates)
+    return Layout("Metashape", None if scale == 1.0 else "m", candidates, notes=images.notes)
 
 
 def _metashape_camera(sensor: Element) -> Camera:
@@ -121,20 +123,20 @@ def _metashape_camera(sensor: Element) -> Camera:
 # OpenSfM
 
 
-def read_opensfm(path: Path) -> Layout | None:
+def read_opensfm(path: Path, images_at: Path | None = None) -> Layout | None:
     """OpenSfM's ``reconstruction.json``, its largest part; poses are world-to-camera."""
     for file in _files(path, "*reconstruction*.json", "opensfm/reconstruction.json"):
         data = json.loads(read_text(file, "PATH"))
         if isinstance(data, list) and data and all("shots" in each and "cameras" in each for each in data):
-            return _opensfm(file, data)
+            return _opensfm(file, data, images_at)
     return None
 
 
-def _opensfm(file: Path, data: list[Entries]) -> Layout:
+def _opensfm(file: Path, data: list[Entries], images_at: Path | None) -> Layout:
     part = max(data, key=lambda each: len(each["shots"]))
     shots = sorted(part["shots"].items())
     folders = image_folders(file.parent, file.parent.parent)
-    images = Images([name for name, _ in shots], folders, file)
+    images = Images([name for name, _ in shots], folders, file, images_at)
 
     def build(frame: CaptureFrame, shot: Entries) -> Candidate:
         turn = Rotation.from_rotvec(array_of(shot["rotation"], (3,), "rotation"))
@@ -142,7 +144,7 @@ def _opensfm(file: Path, data: list[Entries]) -> Layout:
         return Candidate(replace(frame, E=np.linalg.inv(T)), _opensfm_camera(part["cameras"][shot["camera"]]))
 
     candidates = [images.candidate(name, partial(build, shot=shot)) for name, shot in shots]
-    notes = list[Message]()
+    notes = list(images.notes)
     if len(data) > 1:
         sizes = ", ".join(str(len(each["shots"])) for each in data if each is not part)
         sentence = f"The largest part, of {len(shots)} images, is used; left out: parts of {sizes}."
@@ -172,16 +174,16 @@ def _opensfm_camera(entries: Entries) -> Camera:
 # Bundler and VisualSFM
 
 
-def read_bundler(path: Path) -> Layout | None:
+def read_bundler(path: Path, images_at: Path | None = None) -> Layout | None:
     """Bundler's ``bundle.out`` and its list of images: world-to-camera, OpenGL's axes, central cameras."""
     for file in _files(path, "*.out", "bundle/*.out"):
         with file.open(encoding="utf-8", errors="replace") as opened:
             if opened.readline().startswith("# Bundle file"):
-                return _bundler(file, opened.readline(), opened)
+                return _bundler(file, opened.readline(), opened, images_at)
     return None
 
 
-def _bundler(file: Path, counts: str, lines: Iterator[str]) -> Layout:
+def _bundler(file: Path, counts: str, lines: Iterator[str], images_at: Path | None) -> Layout:
     above = (file.parent, file.parent.parent)
     names_of = [folder / name for folder in above for name in (f"{file}.list.txt", *LISTS)]
     listed = next((each for each in names_of if each.is_file()), names_of[1])
@@ -190,7 +192,7 @@ def _bundler(file: Path, counts: str, lines: Iterator[str]) -> Layout:
     count = int(counts.split()[0])
     if count != len(names):
         bad_value(f"{listed.name}", f"of the {count} images of {file.name}", f"{len(names)}")
-    images = Images(names, image_folders(*above), file)
+    images = Images(names, image_folders(*above), file, images_at)
 
     def build(frame: CaptureFrame, rows: list[str]) -> Candidate:
         f, k1, k2 = array_of(rows[0].split(), (3,), "f k1 k2")
@@ -204,7 +206,7 @@ def _bundler(file: Path, counts: str, lines: Iterator[str]) -> Layout:
     blocks = [[next(lines, "") for _ in range(5)] for _ in names]
     pairs = zip(images.names, blocks, strict=True)
     candidates = [images.candidate(name, partial(build, rows=rows)) for name, rows in pairs]
-    return Layout("Bundler", None, candidates)
+    return Layout("Bundler", None, candidates, notes=images.notes)
 
 
 def _central(frame: CaptureFrame, f: float, coefficients: tuple[float, ...]) -> Camera:
@@ -213,21 +215,22 @@ def _central(frame: CaptureFrame, f: float, coefficients: tuple[float, ...]) -> 
     return Camera(intrinsics(f, f, (size[0] - 1) / 2, (size[1] - 1) / 2), size, coefficients)
 
 
-def read_nvm(path: Path) -> Layout | None:
+def read_nvm(path: Path, images_at: Path | None = None) -> Layout | None:
     """VisualSFM's NVM: a line an image, with its focal length, world-to-camera quaternion and centre."""
     for file in _files(path, "*.nvm"):
         with file.open(encoding="utf-8", errors="replace") as opened:
             if opened.readline().startswith("NVM_V3"):
-                return _nvm(file, (line for line in opened if line.strip()))
+                return _nvm(file, (line for line in opened if line.strip()), images_at)
     return None
 
 
-def _nvm(file: Path, lines: Iterator[str]) -> Layout:
+def _nvm(file: Path, lines: Iterator[str], images_at: Path | None) -> Layout:
     rows = [
         re.split(r"\t|(?<=\S)\s+(?=(?:[-+.\deE]+\s+){9}[-+.\deE]+\s*$)", next(lines, ""), maxsplit=1)
         for _ in range(int(next(lines, "0")))
     ]
-    images = Images([row[0].strip() for row in rows], image_folders(file.parent, file.parent.parent), file)
+    folders = image_folders(file.parent, file.parent.parent)
+    images = Images([row[0].strip() for row in rows], folders, file, images_at)
 
     def build(frame: CaptureFrame, words: str) -> Candidate:
         f, qw, qx, qy, qz, *place, k, _ = array_of(words.split(), (10,), "the numbers of an image")
@@ -237,4 +240,5 @@ def _nvm(file: Path, lines: Iterator[str]) -> Layout:
         return Candidate(replace(frame, E=pose_of(turn, place)), _central(frame, f, lens))
 
     pairs = zip(images.names, rows, strict=True)
-    return Layout("VisualSFM", None, [images.candidate(n, partial(build, words=row[-1])) for n, row in pairs])
+    candidates = [images.candidate(name, partial(build, words=row[-1])) for name, row in pairs]
+    return Layout("VisualSFM", None, candidates, notes=images.notes)

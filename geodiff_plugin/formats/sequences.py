@@ -18,13 +18,12 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.formats.files import read_matrix, read_rows, read_text
+from geodiff_plugin.formats.image_files import images_in, images_of
 from geodiff_plugin.formats.layouts import (
     Candidate,
     CaptureFrame,
     Layout,
     build_frame,
-    images_in,
-    images_of,
 )
 from geodiff_plugin.formats.recordings import is_video, video_facts
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, reading_whole, rigid

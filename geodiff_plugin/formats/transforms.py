@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,8 @@ import numpy as np
 
 from geodiff_plugin._checks import bad_value, check_positive
 from geodiff_plugin.formats.files import read_text, stored_size
-from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout, image_folders
+from geodiff_plugin.formats.image_files import image_folders
+from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout
 from geodiff_plugin.formats.rigs import (
     LENS_MODELS,
     Camera,
@@ -147,19 +148,20 @@ def read_nerf(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     return make_rig(nerf_camera(left, choice.image_size), nerf_camera(right, choice.image_size), E)
 
 
-def read_transforms(path: Path) -> Layout | None:
+def read_transforms(path: Path, images_at: Path | None = None) -> Layout | None:
     """The frames that a file names, or the file of a folder; depth maps by name or as ``depth/NAME``."""
     file = _file_of(path)
     if file is None:
         return None
     frames = list(nerf_frames(read_text(file, "PATH")))
-    images = Images([str(frame["file_path"]) for frame in frames], _folders(file), file)
+    images = _images(frames, file, images_at)
     candidates = [
         images.candidate(name, partial(_build, entries=entries, folder=file.parent))
         for name, entries in zip(images.names, frames, strict=True)
     ]
     solved = any(key in entries for entries in frames for key in OF_COLMAP)
-    return Layout(TRANSFORMS, None if solved else "m", candidates, as_stored=True, notes=_notes(file))
+    notes = (*_notes(file), *images.notes)
+    return Layout(TRANSFORMS, None if solved else "m", candidates, as_stored=True, notes=notes)
 
 
 def _file_of(path: Path) -> Path | None:
@@ -171,14 +173,14 @@ def _file_of(path: Path) -> Path | None:
     return None if file == path and not ('"frames"' in text and '"file_path"' in text) else file
 
 
-def transforms_of(path: Path) -> TransformsFile | None:
+def transforms_of(path: Path, images_at: Path | None = None) -> TransformsFile | None:
     """The entries of the file that ``read_transforms`` reads; ``None`` for another capture."""
     file = _file_of(path)
     if file is None:
         return None
     data = json.loads(read_text(file, "PATH"))
     frames = [frame for frame in data["frames"] if "file_path" in frame]
-    images = Images([str(frame["file_path"]) for frame in frames], _folders(file), file)
+    images = _images(frames, file, images_at)
     of_image: dict[Path, Frame] = {}
     for name, frame in zip(images.names, frames, strict=True):
         if (image := images.file(name)) is not None:
@@ -201,11 +203,13 @@ def named_in_transforms(file: TransformsFile | None, name: Any) -> Path | None:
     return path if path.is_relative_to(folder) and os.path.isfile(path) else None
 
 
-def _folders(file: Path) -> list[Path]:
-    """Where the images of a file may lie, from its own folder on."""
-    of_scannetpp = UNDISTORTED_FOLDERS if "undistorted" in file.stem else DISTORTED_FOLDERS
+def _images(frames: Iterable[Frame], file: Path, images_at: Path | None) -> Images:
+    """The images of the frames of a file, from its own folder on; ScanNet++'s are beside that."""
+    folders = [UNDISTORTED_FOLDERS, DISTORTED_FOLDERS]
+    of_scannetpp, of_other_lens = folders if "undistorted" in file.stem else folders[::-1]
     beside = [file.parent.parent / name for name in of_scannetpp]
-    return [*image_folders(file.parent), *(folder for folder in beside if folder.is_dir())]
+    places = [*image_folders(file.parent), *(folder for folder in beside if folder.is_dir())]
+    return Images([str(frame["file_path"]) for frame in frames], places, file, images_at, of_other_lens)
 
 
 def _notes(file: Path) -> tuple[Message, ...]:

@@ -26,6 +26,7 @@ from geodiff_plugin.capture.results import ALONE, save_alone, write_agreement, w
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.formats.files import MAP_SUFFIXES, find_map, read_matrix
 from geodiff_plugin.formats.out import REPORT, OutFolder, atomic_path, check_new, working_in, write_text
+from geodiff_plugin.formats.transforms import TRANSFORMS, transforms_of
 from geodiff_plugin.jobs.failures import Failures
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Record, Shard, shards_beside
 from geodiff_plugin.jobs.lengths import KnownScale, check_lengths, known_scale, measure, spans_to_measure
@@ -67,7 +68,9 @@ class RunKeys:
 def open_capture(options: CaptureOptions) -> Capture:
     """The capture of the options, without poses solved."""
     K = None if options.k is None else read_matrix(options.k, "--K")
-    capture = Capture.open(options.path, K=K, fov=options.fov, trajectory=options.trajectory)
+    capture = Capture.open(
+        options.path, K=K, fov=options.fov, trajectory=options.trajectory, images=options.images
+    )
     if options.poses == "given" and capture.poses is None:
         bad_value("--poses given", "used with a capture that has poses", f"{options.path} without")
     if "mesh" in options.export and find_spec("open3d") is None:
@@ -381,7 +384,8 @@ def _depth_of_frames(
         raise InputError(f"No frame got depth: {frames[0]['error']}")
     agreement = write_agreement(capture, options.out, done)
     doubted = outcome["not_trusted"]
-    files = write_results(capture, options.out, done, options.export, doubted, options.path)
+    original = transforms_of(options.path, options.images) if capture.kind == TRANSFORMS else None
+    files = write_results(capture, options.out, done, options.export, doubted, original)
     seconds["agreement and cloud"] = progress.seconds(*seconds.values())
     report = {
         "version": __version__,

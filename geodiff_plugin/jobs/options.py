@@ -446,6 +446,9 @@ class CaptureOptions(SpeedOptions, PriorOptions):
     trajectory: Path | None = _camera(
         None, "Poses of a video in TUM's form: 'seconds tx ty tz qx qy qz qw' on each line."
     )
+    images: Path | None = _camera(
+        None, "Folder of the images that a file of cameras names, where they lie elsewhere.", metavar="DIR"
+    )
     prior_map: Path | None = _prior(
         None, "Take another model's depth maps as the prior: a folder with NAME.npy for each frame."
     )

@@ -481,10 +481,15 @@ def test_paths_of_other_machines_and_suffixes_are_found(form, tmp_path):
 
 
 def test_images_that_are_nowhere_are_named_with_the_places_searched(tmp_path):
-    folder = write_transforms(tmp_path, TRUE, TRUE)
-    (folder / "images").rename(folder / "pictures")
-    with pytest.raises(InputError, match=r"got 0 in .*f00.png, .*: no image file in its folder; 4 skipped"):
+    folder = write_transforms(tmp_path / "a/b/scan", TRUE, TRUE)
+    (folder / "images").rename(tmp_path / "pictures")
+    said = r"got 0 in .*f00.png, .*: no image file in its folder or elsewhere near it.*--images.*4 skipped"
+    with pytest.raises(InputError, match=said):
         Capture.open(folder)
+    capture = Capture.open(folder, images=tmp_path / "pictures")
+    assert capture.frames[3].image == tmp_path / "pictures/f03.png" and not capture.notes
+    with pytest.raises(InputError, match=r"images \(--images\) must be a folder"):
+        Capture.open(folder, images=tmp_path / "pictures/f00.png")
 
 
 def test_scannetpp_keeps_images_of_two_lenses_apart(tmp_path):
