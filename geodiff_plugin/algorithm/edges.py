@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin._strips import row_strips
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.scale.points import weighted_quantile
@@ -46,6 +47,10 @@ def sharpen_edges(depth_m: Tensor, left_01: Tensor, spacing: int = 1) -> Tensor:
     the ramp, of another colour or far away count for less. ``depth_m (B, 1, H, W)`` and ``left_01`` lie on
     one grid; ``spacing`` is its pixels per pixel of the grid that the map was decoded on.
     """
+    if use_kernel(depth_m):
+        from geodiff_plugin.algorithm import edge_kernels
+
+        return edge_kernels.sharpened(depth_m, left_01, spacing)
     height, width = image_size(depth_m)
     halo = (BESIDE + 1) * spacing
     out = depth_m.clone()

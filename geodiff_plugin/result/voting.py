@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._kernels import launch_bound
+from geodiff_plugin._kernels import launch_bound, use_kernel
 from geodiff_plugin.algorithm.correction import highest, range_around
 from geodiff_plugin.algorithm.edges import HALF, REACH, STRIP
 from geodiff_plugin.evidence.evidence import Evidence
@@ -65,10 +65,23 @@ SOFT = 4.0
 MOST_SOFT = 0.14
 #: Votes within about this many pixels of the median make the mean.
 NEAR_PX = 1.0
+#: Halvings that find a weighted median.
+ROUNDS = 7
 #: As ``STRIP``, where a launch costs more than a cache gives: some 200 MB of votes.
 STRIP_OF_DEVICE = 1 << 18
 #: Side of the last median filter, pixels of the voting grid.
 MEDIAN = 5
+
+
+class Voters(NamedTuple):
+    """Who votes on the depth of an image: maps ``(H, W)`` on the grid of the votes."""
+
+    depth_m: Tensor  # metres, of the map
+    inverse_depth: Tensor  # 1/m, of matches and known points
+    confidence: Tensor  # of these
+    known: Tensor  # their ``known_share``
+    rows: RowMatches
+    px: Tensor  # () on the CPU, shift between the views of a depth of 1 m
 
 
 class _Votes(NamedTuple):
@@ -120,22 +133,36 @@ def vote_depth(
         F.interpolate(each.float(), size, mode="nearest-exact")[0, 0]
         for each in (depth_m, target.inverse_depth, target.confidence, known)
     )
-    px = K[0, 0] * rows.baseline_m  # shift of a depth of 1 m
-    shift, matched_px = px / small_m, px * inverse_depth
+    px = K[0, 0] * rows.baseline_m
     error = _error_at_edges(error, small_m, size[1] / full[1] * spacing)
-    voters = (
-        _weighed(_Votes(rows.shift, known * (ROWS * rows.matched + FILLED * rows.filled)), shift, error),
-        # The confidence of a known point is a count.
-        _weighed(_Votes(matched_px, known * confidence.clamp(0.0, 1.0)), shift, error),
-    )
     map_vote = MAP_VOTE * (WEAK_PRIOR / error).clamp_min(1.0) ** 3
-    voted = _vote_in_windows(voters, left, shift, map_vote)
-    # The median smooths ragged borders; a map that outvotes its matches has none, and known points stay.
-    voted = torch.where((map_vote < 1.0) & (confidence <= 1.0), _median_filtered(voted), voted)
+    voted = _voted(Voters(small_m, inverse_depth, confidence, known, rows, px), left, error, map_vote)
     if size != full:
         voted = _enlarged(voted, left, _resized(evidence.native, full)[0])
     out_m = (px / voted.clamp_min(1e-6))[None, None].clamp(depth_m.amin(), depth_m.amax())
     return out_m.to(depth_m.dtype)
+
+
+def _voted(given: Voters, left: Tensor, error: Tensor, map_vote: Tensor) -> Tensor:
+    """``(H, W)`` pixels of shift that the voters agree on; ``map_vote ()`` is the weight of the map.
+
+    ``left (3, H, W)`` is the image, ``error ()`` that of the prior.
+    """
+    if use_kernel(left):
+        from geodiff_plugin.result import kernels
+
+        return kernels.voted(given, left, error, map_vote)
+    rows, shift = given.rows, given.px / given.depth_m
+    of_rows = given.known * (ROWS * rows.matched + FILLED * rows.filled)
+    # The confidence of a known point is a count.
+    of_matches = given.known * given.confidence.clamp(0.0, 1.0)
+    voters = (
+        _weighed(_Votes(rows.shift, of_rows), shift, error),
+        _weighed(_Votes(given.px * given.inverse_depth, of_matches), shift, error),
+    )
+    voted = _vote_in_windows(voters, left, shift, map_vote)
+    # The median smooths ragged borders; a map that outvotes its matches has none, and known points stay.
+    return torch.where((map_vote < 1.0) & (given.confidence <= 1.0), _median_filtered(voted), voted)
 
 
 def _resized(native: PosedViews, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -197,7 +224,7 @@ def _weighed(votes: _Votes, shift: Tensor, error: Tensor) -> _Votes:
     return votes._replace(weight=votes.weight / (1.0 + apart) ** 2)
 
 
-def weighted_median(values: Tensor, weight: Tensor, rounds: int = 7) -> Tensor:
+def weighted_median(values: Tensor, weight: Tensor, rounds: int = ROUNDS) -> Tensor:
     """Weighted median over the first axis, to within ``2**-rounds`` of the values' range, by bisection.
 
     Where all weights are 0, about the least value.

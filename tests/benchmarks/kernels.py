@@ -21,10 +21,12 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
+from geodiff_plugin.algorithm import edge_kernels
 from geodiff_plugin.algorithm import kernels as algorithm
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.matching import kernels as matching
 from geodiff_plugin.matching.census import MARGIN_PX, SIDE, VOTE_LEVELS
+from geodiff_plugin.result import kernels as result
 from geodiff_plugin.runtime import kernels as runtime
 from geodiff_plugin.scale import kernels as scale
 from geodiff_plugin.scale.points import KERNEL_FORMS
@@ -55,6 +57,7 @@ def launches() -> Iterator[Compiled]:
     yield from _of_the_solver()
     yield from _of_the_networks()
     yield from _of_the_scale()
+    yield from _of_the_result()
 
 
 def _of_the_matching() -> Iterator[Compiled]:
@@ -82,6 +85,18 @@ def _of_the_networks() -> Iterator[Compiled]:
     norm = "*bf16 *bf16 *fp32 *bf16 *bf16" + 6 * " i32" + " fp32"
     sizes = sizes | {"PARTS": runtime.MOST_PARTS}
     yield Compiled("group norm", runtime.normalise_kernel, norm, sizes, 4)
+
+
+def _of_the_result() -> Iterator[Compiled]:
+    sizes = {"CHANNELS": 3, "BLOCK": edge_kernels.BLOCK, "PADDED": edge_kernels.PADDED}
+    sharpen, warps = "*fp32 *fp32 *fp32 i32 i32 i32", edge_kernels.WARPS
+    yield Compiled("sharp edges", edge_kernels.sharpen_kernel, sharpen, sizes, warps)
+    sizes = {"CHANNELS": 3, "BLOCK": result.BLOCK, "VOTES": result.VOTES}
+    vote = 11 * "*fp32 " + "fp32 fp32 i32 i32"
+    yield Compiled("votes", result.vote_kernel, vote, sizes, result.WARPS)
+    sizes = {"BLOCK": result.BLOCK, "IN_MEDIAN": result.IN_MEDIAN}
+    median = "*fp32 *fp32 *fp32 *fp32 i32 i32"
+    yield Compiled("median of votes", result.median_kernel, median, sizes, result.WARPS)
 
 
 def _of_the_scale() -> Iterator[Compiled]:

@@ -38,7 +38,14 @@ from tests.benchmarks.random_marigold import random_marigold
 __all__ = ["Counted", "count_guided_call"]
 
 #: Functions that choose between a kernel and its reference: pure functions of tensors.
-WITH_KERNELS = ("sweep_planes", "match_volume", "solve_field", "refine_to_matches")
+WITH_KERNELS = (
+    "sweep_planes",
+    "match_volume",
+    "solve_field",
+    "refine_to_matches",
+    "sharpen_edges",
+    "_voted",
+)
 #: Functions, and methods as ``Class.method``, whose operations are shown apart; each without those below it.
 STAGES = (
     "clean",
