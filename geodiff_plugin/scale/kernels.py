@@ -1,18 +1,30 @@
-"""Triton kernel of the scale's refinement, whose reference is ``scale.points.refine_to_matches``.
+"""Triton kernel of the scale's refinement, by the reference ``scale.points.refine_to_matches``; its formulas.
 
 This module is imported only where ``use_kernel`` says so, because it imports Triton.
 """
 
 from __future__ import annotations
 
-import torch
+import math
+
 import triton
 import triton.language as tl
 from torch import Tensor
 
 from geodiff_plugin._kernels import launched_on
-from geodiff_plugin.scale.points import KERNEL_FORMS, FitTarget
+from geodiff_plugin.matching import Matches
+from geodiff_plugin.scale import points
+from geodiff_plugin.scale.points import KERNEL_FORMS
 
+# A kernel reads constants of its module only as these.
+_FIT_NOISE = tl.constexpr(points.FIT_NOISE)
+_FIT_FLOOR = tl.constexpr(points.FIT_FLOOR)
+_FIT_CAUCHY = tl.constexpr(points.FIT_CAUCHY)
+_REFERENCE_DOUBT = tl.constexpr(points.REFERENCE_DOUBT)
+_LEAST_DOUBT = tl.constexpr(points.LEAST_DOUBT)
+_NEAR_FACTOR = tl.constexpr(math.exp(points.NEAR_REACH))
+_FAR_FACTOR = tl.constexpr(math.exp(points.FAR_REACH))
+_FULLEST = tl.constexpr(points.FULLEST)
 #: Matches of a program that are held at once, at least: fewer would compile another kernel for few matches.
 _LEAST_BLOCK = 1024
 #: Matches whose equations are summed at once, fewer than are searched for their median.
@@ -28,8 +40,8 @@ _HALVINGS = tl.constexpr(31)
 
 
 @triton.jit
-def _log_depth(v, FORM: tl.constexpr):
-    """``Space.forward`` at a global scale of 1, its logarithm."""
+def forward(v, FORM: tl.constexpr):
+    """``Space.forward`` at a global scale of 1."""
     if FORM == 0:
         depth = v
     elif FORM == 1:
@@ -40,7 +52,53 @@ def _log_depth(v, FORM: tl.constexpr):
         depth = tl.exp(v) - 1.0
     else:
         depth = 1.0 / (v * v)
-    return tl.log(tl.maximum(depth, 1e-9))
+    return depth
+
+
+@triton.jit
+def inverse(depth, FORM: tl.constexpr):
+    """``Space.inverse``."""
+    if FORM == 0:
+        v = depth
+    elif FORM == 1:
+        v = 1.0 / depth
+    elif FORM == 2:
+        v = tl.log(depth)
+    elif FORM == 3:
+        v = tl.log(1.0 + depth)
+    else:
+        v = 1.0 / tl.sqrt(depth)
+    return v
+
+
+@triton.jit
+def ends(near, far, FORM: tl.constexpr):
+    """``Space.ends``: disparities fall with depth."""
+    if (FORM == 1) or (FORM == 4):
+        at_zero, at_one = far, near
+    else:
+        at_zero, at_one = near, far
+    return at_zero, at_one
+
+
+@triton.jit
+def value_at(x, pixel, height, width, rows, columns):
+    """A map ``(rows, columns)`` at pixels of a grid of another size, as ``torch`` interpolates."""
+    v = tl.maximum(((pixel // width).to(tl.float32) + 0.5) * (rows / height) - 0.5, 0.0)
+    u = tl.maximum(((pixel % width).to(tl.float32) + 0.5) * (columns / width) - 0.5, 0.0)
+    top, left = tl.minimum(v.to(tl.int32), rows - 1), tl.minimum(u.to(tl.int32), columns - 1)
+    down, right = v - top.to(tl.float32), u - left.to(tl.float32)
+    below, beside = tl.minimum(top + 1, rows - 1) * columns, tl.minimum(left + 1, columns - 1)
+    top = top * columns
+    above = (1.0 - right) * tl.load(x + top + left) + right * tl.load(x + top + beside)
+    under = (1.0 - right) * tl.load(x + below + left) + right * tl.load(x + below + beside)
+    return (1.0 - down) * above + down * under
+
+
+@triton.jit
+def _log_depth(v, FORM: tl.constexpr):
+    """The logarithm of ``forward``."""
+    return tl.log(tl.maximum(forward(v, FORM), 1e-9))
 
 
 @triton.jit
@@ -126,25 +184,61 @@ def _normal_equations(
     return tl.sum(n00, 0), tl.sum(n01, 0), tl.sum(n11, 0), tl.sum(g0, 0), tl.sum(g1, 0)
 
 
-@triton.jit(do_not_specialize=["count", "iterations"])
+@triton.jit
+def _gather(
+    x, at, map_inverse, map_confidence, values, inverse_at, confidence, deviation, count, stride,
+    height, width, rows, columns, CHUNK: tl.constexpr,
+):  # fmt: skip
+    """Write the value of the map at every match, and what is known of the match, side by side."""
+    for first in range(0, count, CHUNK):
+        k = first + tl.arange(0, CHUNK)
+        inside = k < count
+        pixel = tl.load(at + k.to(tl.int64) * stride, inside, 0).to(tl.int32)
+        sure = tl.load(map_confidence + pixel)
+        doubt = tl.maximum((1.0 - sure) / _REFERENCE_DOUBT, _LEAST_DOUBT)
+        tl.store(values + k, value_at(x, pixel, height, width, rows, columns), inside)
+        tl.store(inverse_at + k, tl.maximum(tl.load(map_inverse + pixel), 0.0), inside)
+        tl.store(confidence + k, sure, inside)
+        tl.store(deviation + k, tl.sqrt(doubt), inside)
+
+
+@triton.jit
+def _bounds(near, far, FORM: tl.constexpr):
+    """The least and the largest end, for the near and the far reach of the fit."""
+    low0, low1 = ends(near / _NEAR_FACTOR, far / _FAR_FACTOR, FORM)
+    high0, high1 = ends(near * _NEAR_FACTOR, far * _FAR_FACTOR, FORM)
+    low0, low1 = inverse(low0, FORM), inverse(low1, FORM)
+    high0, high1 = inverse(high0, FORM), inverse(high1, FORM)
+    return tl.minimum(low0, high0), tl.minimum(low1, high1), tl.maximum(low0, high0), tl.maximum(low1, high1)
+
+
+@triton.jit(do_not_specialize=["count", "stride", "iterations"])
 def refine_kernel(
-    ends, lower, upper, residuals, values, inverse, confidence, deviation, noise_of_match,
-    count, iterations, floor, cauchy,
+    x, at, map_inverse, map_confidence, step, near_m, far_m, scratch, refined,
+    count, stride, height, width, rows, columns, iterations,
     FORM: tl.constexpr, BLOCK: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
     """All reweighted Gauss-Newton steps (``points._refine_once``) of a map, by one program."""
     row = tl.program_id(0)
-    x_at, size = values + row * count, residuals + row * count
-    noise = tl.load(noise_of_match)
-    e0, e1 = tl.load(ends + 2 * row), tl.load(ends + 2 * row + 1)
-    low0, low1 = tl.load(lower + 2 * row), tl.load(lower + 2 * row + 1)
-    high0, high1 = tl.load(upper + 2 * row), tl.load(upper + 2 * row + 1)
+    x += row * rows * columns
+    scratch += row * 5 * count
+    values, inverse_at, confidence = scratch, scratch + count, scratch + 2 * count
+    deviation, size = scratch + 3 * count, scratch + 4 * count
+    _gather(
+        x, at, map_inverse, map_confidence, values, inverse_at, confidence, deviation, count, stride,
+        height, width, rows, columns, CHUNK,
+    )  # fmt: skip
+    noise = tl.load(step) * _FIT_NOISE
+    near, far = tl.load(near_m + row), tl.load(far_m + row)
+    e0, e1 = ends(near, far, FORM)
+    e0, e1 = inverse(e0, FORM), inverse(e1, FORM)
+    low0, low1, high0, high1 = _bounds(near, far, FORM)
     for _ in range(iterations):
-        _store_residuals(x_at, inverse, noise, e0, e1, size, count, FORM, CHUNK)
+        _store_residuals(values, inverse_at, noise, e0, e1, size, count, FORM, CHUNK)
         median = _weighted_median(size, confidence, count, BLOCK)
         n00, n01, n11, g0, g1 = _normal_equations(
-            x_at, inverse, confidence, deviation, noise, e0, e1, tl.maximum(1.4826 * median, floor),
-            count, cauchy, FORM, CHUNK,
+            values, inverse_at, confidence, deviation, noise, e0, e1, tl.maximum(1.4826 * median, _FIT_FLOOR),
+            count, _FIT_CAUCHY, FORM, CHUNK,
         )  # fmt: skip
         damping = 1e-12 * (n00 + n11) + 1e-20
         a00, a11 = n00 + 1e-4 * n00 + damping, n11 + 1e-4 * n11 + damping
@@ -156,8 +250,9 @@ def refine_kernel(
         new0 = _settled(e0, f0, f1, b1, low0, high0, g0, n01, e1, n00)
         e1 = _settled(e1, f1, f0, b0, low1, high1, g1, n01, e0, n11)
         e0 = new0
-    tl.store(ends + 2 * row, e0)
-    tl.store(ends + 2 * row + 1, e1)
+    near, far = ends(forward(e0, FORM), forward(e1, FORM), FORM)
+    tl.store(refined + row, tl.minimum(near, far * _FULLEST))
+    tl.store(refined + tl.num_programs(0) + row, far)
 
 
 def warps(block: int) -> int:
@@ -165,35 +260,35 @@ def warps(block: int) -> int:
     return min(_MOST_WARPS, block // _MATCHES_A_WARP)
 
 
-def refined_ends(
-    space: str,
-    ends: Tensor,
-    values: Tensor,
-    target: FitTarget,
-    bounds: tuple[Tensor, Tensor],
-    limits: tuple[int, float, float],
-) -> Tensor:
-    """``ends (B, 2)`` after all steps; arguments as ``points._refine_once`` takes them.
-
-    ``limits`` are the number of steps, the least residual of a map, and the width of the Cauchy weight.
-    """
-    rows, count = values.shape
+def refined_range(
+    x: Tensor, matches: Matches, near_m: Tensor, far_m: Tensor, space: str
+) -> tuple[Tensor, Tensor]:
+    """``points.refine_to_matches``, where there is a match."""
+    at = matches.above(0.0)
+    stride = points.sampling_stride(at)
+    count = -(-len(at) // stride)
+    x = x.float().contiguous()
+    scratch, refined = x.new_empty(len(x), 5, count), x.new_empty(2, len(x))
     block = max(_LEAST_BLOCK, triton.next_power_of_2(count))
-    refined = ends.float().clone().contiguous()
-    launched_on(values, refine_kernel[(rows,)])(
+    launched_on(x, refine_kernel[(len(x),)])(
+        x,
+        at,
+        matches.inverse_depth.contiguous(),
+        matches.confidence.contiguous(),
+        matches.plane_step,
+        near_m.contiguous(),
+        far_m.contiguous(),
+        scratch,
         refined,
-        *(bound.float().contiguous() for bound in bounds),
-        torch.empty_like(values, dtype=torch.float32, memory_format=torch.contiguous_format),
-        values.float().contiguous(),
-        target.inverse_depth.float().contiguous(),
-        target.confidence.float().contiguous(),
-        target.deviation.float().contiguous(),
-        torch.as_tensor(target.noise).float().reshape(1),
         count,
-        *limits,
+        stride,
+        *matches.size,
+        *x.shape[-2:],
+        points.FIT_ITERATIONS,
         FORM=KERNEL_FORMS[space],
         BLOCK=block,
         CHUNK=CHUNK,
         num_warps=warps(block),
     )
-    return refined
+    nearest, farthest = refined.unbind()
+    return nearest, farthest

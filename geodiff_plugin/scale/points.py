@@ -54,11 +54,13 @@ FAR_REACH = 0.7
 ORDER_SAMPLES = 4000
 #: Lower bound on them: the rank correlation of fewer is chance.
 ORDER_FEWEST = 40
-# The variance of a match is proportional to its doubt, ``1 - confidence``: so it was on pairs with truth.
-# ``FIT_NOISE`` holds at this doubt.
-_REFERENCE_DOUBT = 0.04
-# Lower doubts count as this share of it at least.
-_LEAST_DOUBT = 0.16
+#: The variance of a match is proportional to its doubt, ``1 - confidence``: so it was on pairs with truth.
+#: ``FIT_NOISE`` holds at this doubt.
+REFERENCE_DOUBT = 0.04
+#: Lower doubts count as this share of it at least.
+LEAST_DOUBT = 0.16
+#: Near is at most this share of far: an empty range has no scale.
+FULLEST = 0.98
 
 
 class FitTarget(NamedTuple):
@@ -134,10 +136,14 @@ def refine_to_matches(
     at = matches.above(0.0)  # all of them: known points are few
     if not len(at):
         return near_m, far_m
-    at = at[:: max(1, len(at) // FIT_SAMPLES)]
+    if use_kernel(x) and space in KERNEL_FORMS:
+        from geodiff_plugin.scale import kernels
+
+        return kernels.refined_range(x, matches, near_m, far_m, space)
+    at = at[:: sampling_stride(at)]
     inverse = matches.inverse_depth.flatten()[at].clamp_min(0.0)
     confidence = matches.confidence.flatten()[at]
-    doubt = ((1.0 - confidence) / _REFERENCE_DOUBT).clamp_min(_LEAST_DOUBT)
+    doubt = ((1.0 - confidence) / REFERENCE_DOUBT).clamp_min(LEAST_DOUBT)
     target = FitTarget(inverse, confidence, doubt.sqrt(), FIT_NOISE * matches.plane_step)
     values = _values_at(x, matches.size, at)
     form = SPACES[space]
@@ -145,16 +151,15 @@ def refine_to_matches(
     lower = _ends(form, near_m / math.exp(NEAR_REACH), far_m / math.exp(FAR_REACH))
     upper = _ends(form, near_m * math.exp(NEAR_REACH), far_m * math.exp(FAR_REACH))
     bounds = torch.minimum(lower, upper), torch.maximum(lower, upper)
-    if use_kernel(values) and space in KERNEL_FORMS:
-        from geodiff_plugin.scale import kernels
-
-        limits = FIT_ITERATIONS, FIT_FLOOR, FIT_CAUCHY
-        ends = kernels.refined_ends(space, ends, values, target, bounds, limits)
-    else:
-        for _ in range(FIT_ITERATIONS):
-            ends = _refine_once(form, ends, values, target, bounds)
+    for _ in range(FIT_ITERATIONS):
+        ends = _refine_once(form, ends, values, target, bounds)
     at_zero, at_one = (form.forward(end, torch.ones_like(end)) for end in ends.unbind(1))
     return ordered(*form.ends(at_zero, at_one))
+
+
+def sampling_stride(at: Tensor) -> int:
+    """Every so many of the matches ``at (P,)`` are fitted to."""
+    return max(1, len(at) // FIT_SAMPLES)
 
 
 def _ends(form: Space, near_m: Tensor, far_m: Tensor) -> Tensor:
@@ -163,8 +168,8 @@ def _ends(form: Space, near_m: Tensor, far_m: Tensor) -> Tensor:
 
 
 def ordered(near_m: Tensor, far_m: Tensor) -> tuple[Tensor, Tensor]:
-    """Both ends, near at most 0.98 of far: an empty range has no scale."""
-    return torch.minimum(near_m, far_m * 0.98), far_m
+    """Both ends, near at most ``FULLEST`` of far."""
+    return torch.minimum(near_m, far_m * FULLEST), far_m
 
 
 def _refine_once(

@@ -100,7 +100,7 @@ def _of_the_result() -> Iterator[Compiled]:
 
 
 def _of_the_scale() -> Iterator[Compiled]:
-    refine = 9 * "*fp32 " + "i32 i32 fp32 fp32"
+    refine = "*fp32 *i64 " + 7 * "*fp32 " + 7 * "i32 "
     for block in (1024, 16384):
         sizes = {"FORM": KERNEL_FORMS["depth"], "BLOCK": block, "CHUNK": scale.CHUNK}
         yield Compiled(f"refinement, {block} matches", scale.refine_kernel, refine, sizes, scale.warps(block))
