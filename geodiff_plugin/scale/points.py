@@ -16,7 +16,7 @@ from torch import Tensor
 from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.matches import UNIT, read_above
-from geodiff_plugin.scale.space import SPACES, MetricMap, Space
+from geodiff_plugin.scale.space import SPACES, SQUARE, MetricMap, Space
 
 #: Matches above this confidence are reliable: more likely right than wrong.
 RELIABLE = 0.5
@@ -44,7 +44,7 @@ FIT_NOISE = 0.5
 FIT_FLOOR = 4e-3
 #: Width of the Cauchy weight, in standard deviations of match and map together.
 FIT_CAUCHY = 2.0
-#: Spaces whose formula the kernel of the fit has, and its number there; in another one the reference runs.
+#: Spaces whose formula the kernels have, and its number there; in another one the reference runs.
 KERNEL_FORMS = {"depth": 0, "disparity": 1, "log": 2, "log1p": 3, "sqrt_disparity": 4}
 #: Bound of the change of near in the fit, as a log factor: the fit must stay in its basin.
 NEAR_REACH = 1.4
@@ -96,8 +96,12 @@ def fit_to_points(
     The best of 1128 log-spaced pairs in mean Cauchy cost of inverse depth, so that some points may be wrong;
     ``current`` ends stay unless a better basin shows up. Coarse: ``refine_to_matches`` does the rest.
     """
+    if use_kernel(x) and metric.space in KERNEL_FORMS:
+        from geodiff_plugin.scale import search_kernels
+
+        return search_kernels.basin(x, points, metric.space, metric.positive == SQUARE, current)
     at = points.above(0.0)
-    at = at[:: max(1, -(-len(at) // BASIN_SAMPLES))]
+    at = at[:: basin_stride(at)]
     target = points.inverse_depth.flatten()[at]
     values = _values_at(x, points.size, at)
     nearest, farthest = depth_span(points)
@@ -155,6 +159,11 @@ def refine_to_matches(
         ends = _refine_once(form, ends, values, target, bounds)
     at_zero, at_one = (form.forward(end, torch.ones_like(end)) for end in ends.unbind(1))
     return ordered(*form.ends(at_zero, at_one))
+
+
+def basin_stride(at: Tensor) -> int:
+    """Every so many of the points ``at (P,)`` take part in the search for a basin."""
+    return max(1, -(-len(at) // BASIN_SAMPLES))
 
 
 def sampling_stride(at: Tensor) -> int:

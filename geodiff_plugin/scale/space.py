@@ -18,6 +18,8 @@ from geodiff_plugin._checks import check_choice
 #: Half-width of the smooth floor, in units of the relative map (whose range is about [0, 1]): so small that a
 #: street from 6 to 330 m gains a third of a metre at its nearest point and nothing elsewhere.
 FLOOR_EPS = 0.001
+#: Least scale and shift of a range: a flat map is legal, and a softplus cannot reach 0.
+LEAST_SHARE = 1e-4
 
 
 def smooth_floor(x: Tensor, eps: float = FLOOR_EPS) -> Tensor:
@@ -199,8 +201,7 @@ class MetricMap:
     def from_range(self, near_m: Tensor, far_m: Tensor) -> AffineState:
         """The affine state under which the two ends of a map have the depths, ``(B,)`` metres."""
         s, t, g = SPACES[self.space].from_ends(*SPACES[self.space].ends(near_m.float(), far_m.float()))
-        tiny = 1e-4  # a flat map is legal; softplus cannot reach 0
-        s, t = s.clamp_min(tiny), t.clamp_min(tiny)
+        s, t = s.clamp_min(LEAST_SHARE), t.clamp_min(LEAST_SHARE)
         if self.positive == SQUARE:
             return AffineState(torch.ones_like(s), torch.ones_like(t), g, (s, t))
         return AffineState(inverse_softplus(s), inverse_softplus(t), g)

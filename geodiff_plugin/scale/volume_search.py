@@ -11,11 +11,15 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._kernels import use_kernel
+from geodiff_plugin.geometry import to_device_of
 from geodiff_plugin.matching import CostVolume
+from geodiff_plugin.scale.points import KERNEL_FORMS
 from geodiff_plugin.scale.space import SPACES, DepthRange
 
 #: Cost beyond which a pixel is an outlier: occluded, a reflection, or wrong in the prior.
@@ -26,8 +30,8 @@ SAMPLES = 6000
 GROUPS = 512
 #: Values of near, and of far, in the coarse grid: 1128 pairs.
 COARSE_GRID = 48
-#: Values of near, and of far, in each of the two finer grids around the best pair.
-FINE_GRID = 13
+#: Values of near, and of far, in each of the finer grids around the best pair.
+FINE_GRIDS = (13, 13)
 #: The current state stays if its cost is this close to the best: a new one restarts scale and shift.
 KEEP_MARGIN = 2e-3
 #: Least share of the pixels that must stay in view of a rectified pair.
@@ -55,13 +59,18 @@ class _Best(NamedTuple):
 
 def group_pixels(x: Tensor, cost: Tensor, in_view: Tensor) -> Groups:
     """Values ``x (P,)``, with ``cost`` and ``in_view (D, P)``, sorted and put into groups of one size."""
-    order, each = x.argsort(), -(-len(x) // GROUPS)
+    order, each = x.argsort(), group_size(len(x))
 
     def summed(values: Tensor) -> Tensor:
         return F.pad(values[..., order], (0, -len(x) % each)).unflatten(-1, (-1, each)).sum(-1)
 
     seen, size = in_view.to(cost), summed(torch.ones_like(x))
     return Groups(summed(x) / size, size, summed(seen), summed(cost.clamp_max(COST_CLAMP) * seen))
+
+
+def group_size(pixels: int) -> int:
+    """Number of pixels in a group."""
+    return -(-pixels // GROUPS)
 
 
 def look_up(groups: Groups, inverse_depth: Tensor, depth_m: Tensor) -> tuple[Tensor, Tensor]:
@@ -115,29 +124,51 @@ def search_scale(
     Source: S7.3. Deviation: two numbers instead of one, clamped census cost instead of L_geo.
     """
     low, high = volume.reach_m if depth_range is None else depth_range
-    at = _sampled(volume.size, valid, x.device)
-    cost, in_view = volume.at_pixels(at)
+    at = _sampled(volume.size, valid, x)
     values = F.interpolate(x.float(), volume.size, mode="bilinear", align_corners=False).flatten(1)[:, at]
-    ranges = []
-    for b, row in enumerate(values):
+    in_use = None if current is None else current[:2]
+    near_m, far_m = _best_range(volume, values, at, space, (low, high), in_use)
+    on_edge = far_m >= high * 0.98
+    if depth_range is not None:  # the volume's near end lies nearer than any match, and cuts nothing off
+        on_edge |= near_m <= low * 1.02
+    return DepthRange(near_m, far_m, on_edge)
+
+
+def _best_range(
+    volume: CostVolume,
+    x: Tensor,
+    at: Tensor,
+    space: str,
+    bounds: tuple[float, float],
+    current: tuple[Tensor, Tensor] | None,
+) -> tuple[Tensor, Tensor]:
+    """Metres ``(B,)`` of the best ends within bounds for values ``x (B, P)`` at pixels ``at (P,)``.
+
+    The ``current`` ends stay unless others are better by ``KEEP_MARGIN``.
+    """
+    if use_kernel(x) and space in KERNEL_FORMS:
+        from geodiff_plugin.scale import search_kernels
+
+        return search_kernels.best_range(volume, x, at, space, bounds, current)
+    (cost, in_view), ranges = volume.at_pixels(at), []
+    for b, row in enumerate(x):
         best_of = partial(_best_of, group_pixels(row, cost, in_view), volume, space)
-        best = _coarse_to_fine(best_of, low, high, row)
+        best = _coarse_to_fine(best_of, *bounds, row)
         if current is not None:
-            a, c = (v[b : b + 1] for v in current[:2])
+            a, c = (v[b : b + 1] for v in current)
             now = best_of(torch.minimum(a, c), torch.maximum(a, c))
             stays = now.cost <= best.cost + KEEP_MARGIN
             best = _Best(*(torch.where(stays, old, new) for old, new in zip(now, best, strict=True)))
-        # The volume's near end lies nearer than any match, so only a given range can cut the scene off.
-        on_edge = (best.far_m >= high * 0.98) | ((best.near_m <= low * 1.02) & (depth_range is not None))
-        ranges.append((best.near_m, best.far_m, on_edge))
-    return DepthRange(*(torch.cat(column) for column in zip(*ranges, strict=True)))
+        ranges.append(best)
+    near_m, far_m, _ = (torch.cat(column) for column in zip(*ranges, strict=True))
+    return near_m, far_m
 
 
-def _sampled(size: tuple[int, int], valid: Tensor | None, device: torch.device) -> Tensor:
+def _sampled(size: tuple[int, int], valid: Tensor | None, like: Tensor) -> Tensor:
     """Flat indices of about ``SAMPLES`` pixels of a grid ``(H, W)``, of those that count if there are any."""
     stride = max(1, round((size[0] * size[1] / SAMPLES) ** 0.5))
-    rows, columns = (torch.arange(stride // 2, side, stride, device=device) for side in size)
-    at = (rows[:, None] * size[1] + columns[None]).flatten()
+    rows, columns = (np.arange(stride // 2, side, stride) for side in size)
+    at = to_device_of(like, (rows[:, None] * size[1] + columns[None]).ravel())
     if valid is None:
         return at
     inside = F.interpolate(valid.float(), size, mode="nearest-exact").flatten()[at] > 0
@@ -148,10 +179,16 @@ def _best_of(groups: Groups, volume: CostVolume, space: str, near_m: Tensor, far
     """The best of candidate ends ``(M,)`` for one map."""
     depth_m = SPACES[space].depth_at(groups.mean[None], near_m[:, None], far_m[:, None])
     mean, share = look_up(groups, volume.inverse_depth, depth_m)
-    least = IN_VIEW_RECTIFIED if volume.rectified else IN_VIEW_POSED
-    mean = mean + (share < least) * 1.0  # so one of these wins only if no pair keeps enough in view
+    mean = (
+        mean + (share < least_in_view(volume)) * 1.0
+    )  # so one of these wins only if no pair keeps enough in view
     k = mean.argmin(keepdim=True)  # a 0-d index would be read back from the device
     return _Best(near_m[k], far_m[k], mean[k])
+
+
+def least_in_view(volume: CostVolume) -> float:
+    """Least share of the pixels that must stay in view."""
+    return IN_VIEW_RECTIFIED if volume.rectified else IN_VIEW_POSED
 
 
 def _coarse_to_fine(
@@ -161,13 +198,13 @@ def _coarse_to_fine(
     grid = torch.linspace(0, 1, COARSE_GRID, dtype=like.dtype, device=like.device)
     log_low, log_span = math.log(low), math.log(high / low)
     i, j = torch.triu_indices(COARSE_GRID, COARSE_GRID, 1, device=like.device)
-    offsets = torch.linspace(-1, 1, FINE_GRID, dtype=like.dtype, device=like.device)
     best = best_of(*(torch.exp(log_low + log_span * grid[k]) for k in (i, j)))
     reach = log_span / (COARSE_GRID - 1)
-    for _ in range(2):
-        n = best.near_m.log() + reach * offsets.repeat_interleave(FINE_GRID)
-        f = best.far_m.log() + reach * offsets.repeat(FINE_GRID)
+    for values in FINE_GRIDS:
+        offsets = torch.linspace(-1, 1, values, dtype=like.dtype, device=like.device)
+        n = best.near_m.log() + reach * offsets.repeat_interleave(values)
+        f = best.far_m.log() + reach * offsets.repeat(values)
         n, f = n.exp().clamp(low, high), f.exp().clamp(low, high)
         best = best_of(torch.minimum(n, f), torch.maximum(n, f))
-        reach = reach / (FINE_GRID - 1) * 2
+        reach = reach / (values - 1) * 2
     return best

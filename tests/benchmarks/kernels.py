@@ -29,7 +29,8 @@ from geodiff_plugin.matching.census import MARGIN_PX, SIDE, VOTE_LEVELS
 from geodiff_plugin.result import kernels as result
 from geodiff_plugin.runtime import kernels as runtime
 from geodiff_plugin.scale import kernels as scale
-from geodiff_plugin.scale.points import KERNEL_FORMS
+from geodiff_plugin.scale import search_kernels as search
+from geodiff_plugin.scale.points import BASIN_CANDIDATES, KERNEL_FORMS
 
 #: Compute capabilities of an A100 and of an H100.
 ARCHITECTURES = (80, 90)
@@ -104,6 +105,18 @@ def _of_the_scale() -> Iterator[Compiled]:
     for block in (1024, 16384):
         sizes = {"FORM": KERNEL_FORMS["depth"], "BLOCK": block, "CHUNK": scale.CHUNK}
         yield Compiled(f"refinement, {block} matches", scale.refine_kernel, refine, sizes, scale.warps(block))
+
+    sizes = {"FORM": KERNEL_FORMS["depth"], "CLIPPED": False, "GRID": BASIN_CANDIDATES, "BLOCK": search.BLOCK}
+    basin = "*fp32 *i64 " + 8 * "*fp32 " + 7 * "i32 "
+    yield Compiled("search by points", search.basin_kernel, basin, sizes, 4)
+    sizes = {"PIXELS": search.GROUPED_PIXELS, "PLANES": search.GROUPED_PLANES}
+    group = "*u8 *i1 *fp32 *i64 *i64 " + 4 * "*fp32 " + 11 * "i32 "
+    yield Compiled("groups of the search", search.group_kernel, group, sizes, 4)
+    sizes = {"FORM": KERNEL_FORMS["depth"], "PADDED": search.PADDED, "BLOCK": search.BLOCK}
+    level = 12 * "*fp32 " + "i32 i32 i32 fp32 fp32 fp32 fp32 fp32 fp32 i32 i32 i32"
+    yield Compiled("search in a volume", search.level_kernel, level, sizes, 4)
+    choose = "*fp32 *fp32 *fp32 *fp32 fp32 fp32 i32 i32"
+    yield Compiled("best candidate", search.choose_kernel, choose, {"PADDED": search.PADDED}, 4)
 
 
 def _of_the_solver() -> Iterator[Compiled]:

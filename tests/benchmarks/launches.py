@@ -42,6 +42,8 @@ WITH_KERNELS = (
     "sweep_planes",
     "match_volume",
     "solve_field",
+    "_best_range",
+    "fit_to_points",
     "refine_to_matches",
     "sharpen_edges",
     "_voted",
