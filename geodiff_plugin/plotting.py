@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +42,8 @@ VIDEO_SUFFIXES = (".mp4", ".webp", ".gif")
 #: A power of two: figures in inches are whole pixels again.
 DPI = 128
 POINTS_PER_PIXEL = 72 / DPI
+#: Legends and headings that are kept: those of a pair and of its overview, with room for what varies.
+MOST_DRAWN = 12
 
 
 def _as_map(values: Any) -> np.ndarray:
@@ -134,30 +138,59 @@ def _sheet(width: int, height: int) -> Any:
     return Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
 
 
+@dataclass(frozen=True)
+class _Legend:
+    """What stands beside a picture: a colour bar with texts at shares of it, and a grey key.
+
+    Attributes:
+        height: pixels, of the picture.
+        letters: their size, pixels.
+        colours: name of a colour map.
+        label: above the bar.
+        marks: shares of the bar, each with its text.
+        unknown: whether there is a key to the grey of pixels that are unknown.
+    """
+
+    height: int
+    letters: int
+    colours: str
+    label: str
+    marks: tuple[tuple[float, str], ...]
+    unknown: bool
+
+
+@functools.lru_cache(MOST_DRAWN)
+def _drawn(legend: _Legend) -> np.ndarray:
+    """``(H, W, 3)`` uint8 of a legend; many maps have the same one, and matplotlib takes long to draw it."""
+    high, size = legend.height, legend.letters
+    gap, bar = size // 2, max(14, high // 24)
+    wide, letters = gap + bar + 5 * size, {"fontsize": size * POINTS_PER_PIXEL}
+    x, thick = gap / wide, bar / wide
+
+    figure, low = _sheet(wide, high), size * (3 if legend.unknown else 1)
+    axes = figure.add_axes((x, low / high, thick, (high - 2 * size - low) / high))
+    ramp = np.linspace(0, 1, 512)[:, None]
+    axes.imshow(ramp, cmap=legend.colours, aspect="auto", origin="lower", extent=(0, 1, 0, 1))
+    axes.set_xticks([])
+    axes.yaxis.tick_right()
+    shares, texts = zip(*legend.marks, strict=True) if legend.marks else ((), ())
+    axes.set_yticks(shares, texts, **letters)
+    axes.tick_params(length=size * POINTS_PER_PIXEL / 3, pad=size * POINTS_PER_PIXEL / 4)
+    figure.text(x, 1 - 0.9 * size / high, legend.label, va="center", **letters)
+    if legend.unknown:
+        key = figure.add_axes((x, size / high, thick, size / high), facecolor=str(GREY / 255))
+        key.set(xticks=[], yticks=[])
+        figure.text(x + thick + size / 2 / wide, 1.5 * size / high, "none", va="center", **letters)
+    return np.asarray(rasterised(figure))
+
+
 def _figure(picture: np.ndarray, colours: str, label: str, marks: Sequence[tuple[float, str]]) -> Image.Image:
     """A picture beside its colour bar with texts at shares of it; a grey key where pixels are unknown."""
     unknown = bool((picture == GREY).all(axis=-1).any())  # no colour is grey
     factor = math.ceil(FIGURE_MIN_HEIGHT / len(picture))  # a whole one, so that pixels stay squares
     picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
-    high, size = len(picture), max(12, len(picture) // 26)
-    gap, bar = size // 2, max(14, high // 24)
-    wide, letters = gap + bar + 5 * size, {"fontsize": size * POINTS_PER_PIXEL}
-    x, thick = gap / wide, bar / wide
-
-    figure, low = _sheet(wide, high), size * (3 if unknown else 1)
-    axes = figure.add_axes((x, low / high, thick, (high - 2 * size - low) / high))
-    ramp = np.linspace(0, 1, 512)[:, None]
-    axes.imshow(ramp, cmap=colours, aspect="auto", origin="lower", extent=(0, 1, 0, 1))
-    axes.set_xticks([])
-    axes.yaxis.tick_right()
-    axes.set_yticks([share for share, _ in marks], [text for _, text in marks], **letters)
-    axes.tick_params(length=size * POINTS_PER_PIXEL / 3, pad=size * POINTS_PER_PIXEL / 4)
-    figure.text(x, 1 - 0.9 * size / high, label, va="center", **letters)
-    if unknown:
-        key = figure.add_axes((x, size / high, thick, size / high), facecolor=str(GREY / 255))
-        key.set(xticks=[], yticks=[])
-        figure.text(x + thick + size / 2 / wide, 1.5 * size / high, "none", va="center", **letters)
-    return Image.fromarray(np.hstack([picture, np.asarray(rasterised(figure))]))
+    legend = _Legend(len(picture), max(12, len(picture) // 26), colours, label, tuple(marks), unknown)
+    return Image.fromarray(np.hstack([picture, _drawn(legend)]))
 
 
 def depth_figure(
@@ -189,6 +222,17 @@ def as_picture(image: Any) -> Image.Image:
     return Image.fromarray(values).convert("RGB")
 
 
+@functools.lru_cache(MOST_DRAWN)
+def _heading(titles: tuple[str, ...], width: int, height: int, cell_width: int, gap: int) -> np.ndarray:
+    """``(height, width, 3)`` uint8, titles above the cells of a row; too long ones in smaller letters."""
+    figure = _sheet(width, height)
+    for k, title in enumerate(titles):
+        size = min(15, 1.7 * cell_width / max(1, len(title))) * POINTS_PER_PIXEL
+        x = (gap + k * (cell_width + gap) + cell_width / 2) / width
+        figure.text(x, 0.5, title, fontsize=size, parse_math=False, ha="center", va="center")
+    return np.asarray(rasterised(figure))
+
+
 def grid(
     images: Sequence[Any], titles: Sequence[str], *, columns: int | None = None, cell_width: int = 320
 ) -> Image.Image:
@@ -206,14 +250,10 @@ def grid(
     wide, top = gap + columns * (cell_width + gap), gap
     sheet, named = Image.new("RGB", (wide, gap + sum(heights)), "white"), iter(titles)
     for row, height in zip(rows, heights, strict=True):
-        figure = _sheet(wide, head)
-        for k, (cell, title) in enumerate(zip(row, named, strict=False)):
-            left = gap + k * (cell_width + gap)
-            sheet.paste(cell, (left, top + head))
-            size = min(15, 1.7 * cell_width / max(1, len(title))) * POINTS_PER_PIXEL  # smaller if too long
-            x = (left + cell_width / 2) / wide
-            figure.text(x, 0.5, title, fontsize=size, parse_math=False, ha="center", va="center")
-        sheet.paste(rasterised(figure), (0, top))
+        names = tuple(itertools.islice(named, len(row)))
+        for k, cell in enumerate(row):
+            sheet.paste(cell, (gap + k * (cell_width + gap), top + head))
+        sheet.paste(Image.fromarray(_heading(names, wide, head, cell_width, gap)), (0, top))
         top += height
     return sheet
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import platform
 import threading
 import time
@@ -17,15 +18,19 @@ PACKAGES = ("geodiff-plugin", "torch", "diffusers", "transformers", "accelerate"
 SAMPLING_INTERVAL_S = 0.05
 
 
+@functools.cache
+def _version_of(package: str) -> str:
+    """Reading it takes milliseconds, and every report says it."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
 def versions() -> dict[str, str]:
     """Version of Python and of every package that a result depends on."""
     numbers = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
-    for name in PACKAGES:
-        try:
-            numbers[name] = version(name)
-        except PackageNotFoundError:
-            numbers[name] = "not installed"
-    return numbers
+    return numbers | {name: _version_of(name) for name in PACKAGES}
 
 
 def pick_device(name: str) -> torch.device:
