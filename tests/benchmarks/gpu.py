@@ -327,7 +327,7 @@ def large(bench: Bench) -> Iterator[Row]:
 
 
 def folder(bench: Bench) -> Iterator[Row]:
-    """Pairs a second of ``geodiff depth`` on a folder, graphs included, and of the stock call on its lefts."""
+    """Pairs a second of ``geodiff depth`` on a folder, graphs included, and of stock calls on its lefts."""
     from geodiff_plugin.jobs.options import DepthOptions  # and what the commands need, in this part alone
     from geodiff_plugin.jobs.prior import graphs_for_many
     from tests.benchmarks.many import MOST_ON_THE_WAY, ManyPairs
