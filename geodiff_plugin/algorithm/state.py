@@ -17,19 +17,36 @@ from geodiff_plugin.algorithm.gradients import RULES, SUMMED, FiniteWatch
 from geodiff_plugin.algorithm.member import Member
 from geodiff_plugin.algorithm.settling import fit_depth_range, search_one_number, span_of_points
 from geodiff_plugin.algorithm.terms import Given, Loss, Objective
-from geodiff_plugin.algorithm.views import chunk_views
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.geometry import resize_image
 from geodiff_plugin.matching import Matches, reject_reflections
 from geodiff_plugin.scale.points import order_agreement
 from geodiff_plugin.scale.space import AffineState, DepthRange, MetricMap, PriorMaps
-from geodiff_plugin.types import StepReport
+from geodiff_plugin.types import CameraView, PosedViews, StepReport
 
 
 def _samples_of_images(image_of_sample: Sequence[int]) -> list[slice]:
     """The samples of every image, which lie side by side."""
     counts = [len(list(samples)) for _, samples in groupby(image_of_sample)]
     return [slice(last - count, last) for count, last in zip(counts, accumulate(counts), strict=True)]
+
+
+def chunk_views(evidence: Sequence[Evidence]) -> PosedViews:
+    """The views of every sample of a chunk on the grid of the evidence, images and K of one size.
+
+    An image with fewer views than another repeats its first one: the terms take the best view of each pixel,
+    so repetition changes nothing.
+    """
+    grids = [image.grid for image in evidence]
+    further = []
+    for v in range(max(len(grid.views) for grid in grids)):
+        views = [grid.views[v if v < len(grid.views) else 0] for grid in grids]
+        height, width = (max(view.image_01.shape[axis] for view in views) for axis in (-2, -1))
+        sized = [CameraView(*resize_image(image, K, (height, width)), T) for image, K, T in views]
+        further.append(CameraView(*map(torch.stack, zip(*sized, strict=True))))
+    left, K_left = torch.stack([grid.left_01 for grid in grids]), torch.stack([grid.K_left for grid in grids])
+    return PosedViews(left, tuple(further), K_left)
 
 
 class Trajectory:

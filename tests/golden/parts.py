@@ -23,8 +23,8 @@ from geodiff_plugin.algorithm.correction import (
 from geodiff_plugin.algorithm.edges import sharpen_edges
 from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.schedule import make_schedule
+from geodiff_plugin.algorithm.state import chunk_views
 from geodiff_plugin.algorithm.terms import Given, Objective, match_exposure, photometric, ssim
-from geodiff_plugin.algorithm.views import chunk_views
 from geodiff_plugin.config import DEFAULT, MARIGOLD_DC, PAPER, UpdatePlan
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.prepare import prepare_evidence, rows_beside

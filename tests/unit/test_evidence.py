@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance
+from geodiff_plugin.algorithm.state import chunk_views
 from geodiff_plugin.algorithm.terms import Given, Objective
-from geodiff_plugin.algorithm.views import chunk_views
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence import store as evidence_store
 from geodiff_plugin.evidence.inputs import Inputs
