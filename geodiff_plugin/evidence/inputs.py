@@ -263,7 +263,7 @@ def left_images(image: Any) -> Tensor:
             expected = f"of {size[2]}x{size[1]} pixels, as {named[0][0]}"
             got = f"{tensor.shape[2]}x{tensor.shape[1]}"
             bad_value(name, expected, got, "Call once for every size.")
-    return torch.stack(tensors)
+    return torch.stack(tensors) if len(tensors) > 1 else tensors[0][None]  # large ones are not copied
 
 
 def _named(image: Any, name: str) -> Iterator[tuple[str, Any]]:
