@@ -46,11 +46,12 @@ def resize_intrinsics(K: Tensor, size_from: tuple[int, int], size_to: tuple[int,
         An integer is a pixel centre, so an image keeps its outer edges at -0.5 and ``W - 0.5``: ``cx =
         319.5`` of 640 columns becomes 159.5 of 320.
     """
-    scale = K.new_tensor([size_to[1] / size_from[1], size_to[0] / size_from[0], 1.0])
-    half = K.new_tensor([0.5, 0.5, 0.0])
-    resized = K * scale[:, None]
-    centre = (K[:, :, 2] + half) * scale - half
-    return torch.cat([resized[:, :, :2], centre[:, :, None]], dim=2)
+    before = K.detach().cpu().numpy()
+    scale = np.array([size_to[1] / size_from[1], size_to[0] / size_from[0], 1.0], before.dtype)
+    half = np.array([0.5, 0.5, 0.0], before.dtype)
+    resized = before * scale[:, None]
+    resized[:, :, 2] = (before[:, :, 2] + half) * scale - half
+    return to_device_of(K, resized)
 
 
 def resize_image(image_01: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -69,11 +70,12 @@ def as_fine_as(image_01: Tensor, K: Tensor, K_left: Tensor) -> tuple[Tensor, Ten
     them differently, and a rectified pair must stay rectified.
     """
     height, width = image_size(image_01)
-    rows, columns = (min(1.0, float(K_left[i, i] / K[i, i])) for i in (1, 0))
+    focal_left, focal = (each.detach().cpu().numpy().diagonal() for each in (K_left, K))
+    columns, rows, _ = np.minimum(focal_left / focal, 1.0).tolist()
     return resize_image(image_01, K, (max(1, round(height * rows)), max(1, round(width * columns))))
 
 
-def is_rectified(K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> Tensor:
+def is_rectified(K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> np.ndarray:
     """Whether points differ along rows only, ``(...)`` bool, for ``(..., 3, 3)`` and ``(..., 4, 4)``.
 
     The rotation is the identity to 1e-3 an entry, ``|t_y|`` and ``|t_z|`` are below 1 % of ``|t_x|``, f
@@ -84,8 +86,7 @@ def is_rectified(K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> 
     t = np.abs(T[..., :3, 3])
     uneven = np.abs(K - K_r)[..., [0, 0, 1, 1], [0, 1, 1, 2]].max(-1)
     sideways = t[..., 1:].max(-1) < SIDEWAYS_TOLERANCE * t[..., 0]
-    rectified = (turned <= ANGLE_TOLERANCE) & sideways & (uneven <= ANGLE_TOLERANCE * K[..., 1, 1])
-    return torch.from_numpy(np.asarray(rectified))
+    return (turned <= ANGLE_TOLERANCE) & sideways & (uneven <= ANGLE_TOLERANCE * K[..., 1, 1])
 
 
 class PlaneRays(NamedTuple):

@@ -105,7 +105,7 @@ def estimate_rig(
     K_left = torch.as_tensor(Ks[0], dtype=torch.float32, device="cpu")
     size = image_size(images[0])
     cloud = None if known.points is None else _as_cloud(as_points(known.points, "points"), K_left, size)
-    images = [cleaned(image, DEFAULT) for image in images]
+    images = list(cleaned(images, DEFAULT))
 
     def posed(Ts: Iterable[np.ndarray]) -> list[CameraView]:
         return [

@@ -5,6 +5,7 @@ Source: S7.3 (the plane-sweep view of the g_s search); the matches are beyond it
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -27,9 +28,9 @@ from geodiff_plugin.scale.points import RELIABLE, reliable_matches
 from geodiff_plugin.types import CameraView, PosedViews, PoseReport
 
 
-def cleaned(image_01: Tensor, config: GuidanceConfig) -> Tensor:
-    """A photograph ``(3, H, W)`` in [0, 1] of native size, without flaws if ``clean_photographs`` is set."""
-    return clean(image_01, config.sweep_pixels) if config.clean_photographs else image_01
+def cleaned(images: Sequence[Tensor], config: GuidanceConfig) -> Sequence[Tensor]:
+    """Photographs ``(3, H, W)`` in [0, 1] of native size, without flaws if ``clean_photographs`` is set."""
+    return clean(images, config.sweep_pixels) if config.clean_photographs else images
 
 
 def make_evidence(
@@ -43,8 +44,8 @@ def make_evidence(
     native, points = given.beside(left_01), given.points_on(left_01.device)
     if not native.views:
         return prepare_evidence(native, points, config, needs_matches)
-    left_01 = cleaned(native.left_01, config)
-    views = [view._replace(image_01=cleaned(view.image_01, config)) for view in native.views]
+    left_01, *images = cleaned([native.left_01, *(view.image_01 for view in native.views)], config)
+    views = [view._replace(image_01=image) for view, image in zip(native.views, images, strict=True)]
     posed = PosedViews(left_01, tuple(views), native.K_left)
     if config.pose == "given":
         return prepare_evidence(posed, points, config, needs_matches, untouched(views)[1])

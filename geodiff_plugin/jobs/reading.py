@@ -316,7 +316,7 @@ def pinhole(
     if lens is None:
         return image_01
     # Before it is resampled: after it the blocks of its compression are no longer found.
-    ready = cleaned(torch.from_numpy(image_01).permute(2, 0, 1), config)
+    (ready,) = cleaned([torch.from_numpy(image_01).permute(2, 0, 1)], config)
     return undistorted(ready.permute(1, 2, 0).contiguous().numpy(), K, lens)
 
 

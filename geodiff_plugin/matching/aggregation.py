@@ -79,6 +79,10 @@ def jump_penalties(grey: Tensor, axes: Sequence[tuple[int, int]]) -> Tensor:
     At a pixel stands the penalty between it and the one a step of the axis before it, which is the same both
     ways. An axis is a step (rows, columns) of 0, 1 or -1 along rows and of 0 or 1 down.
     """
+    if use_kernel(grey):
+        from geodiff_plugin.matching import kernels
+
+        return kernels.jump_penalties(grey, axes)
     difference = grey.new_zeros(len(axes), *grey.shape)
     height, width = grey.shape
     for of_axis, (down, across) in zip(difference, axes, strict=True):

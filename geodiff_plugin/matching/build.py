@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from kornia.geometry.linalg import inverse_transformation
 from torch import Tensor
@@ -85,20 +86,20 @@ def pilot_volume(
     nearest = [view.inverse_depth_at(PILOT_SHIFT * left.shape[-1]) for view in views]
     limit = min(max(nearest), MOST_NEARER * min(nearest))
     planes = even_planes(views, (0.0, limit), PILOT_STEP_PX, _FEWEST_PLANES, PILOT_PLANES)
-    return sweep_planes(left, small, K, planes)
+    return sweep_planes(left, small, K, planes, views)
 
 
 def _nearest_inverse_depth(pilot: CostVolume) -> float:
     """The inverse depth at which the planes end, somewhat nearer than the matches of a coarse sweep."""
     matches = match_volume(pilot)
-    reliable = matches.confidence > PILOT_CONFIDENCE
-    inverse_depth = torch.where(reliable, matches.inverse_depth, torch.nan)
-    # The one number of a sweep for which the device is waited for: how near the planes reach.
-    read = torch.stack([torch.nanquantile(inverse_depth, PILOT_QUANTILE), reliable.float().mean()])
-    nearest, share = read.tolist()
+    # The one time that a sweep waits for the device: the host decides how near the planes reach. To read such
+    # small maps takes less time than to launch what a quantile is made of.
+    confidence, inverse_depth = torch.cat([matches.confidence, matches.inverse_depth]).cpu().numpy()
+    reliable = confidence > PILOT_CONFIDENCE
     limit = float(pilot.inverse_depth[-1])
-    if share < PILOT_LEAST_SHARE:  # then the planes must span everything
+    if reliable.mean() < PILOT_LEAST_SHARE:  # then the planes must span everything
         return limit
+    nearest = float(np.quantile(inverse_depth[reliable], np.float32(PILOT_QUANTILE)))
     least = min(view.inverse_depth_at(LEAST_SHIFT * pilot.size[1]) for view in pilot.parallax)
     return min(max(HEADROOM * nearest, least), limit)
 
@@ -127,7 +128,7 @@ def build_cost_volume(
         span = 1.0 / depth_range[1], 1.0 / depth_range[0]
     views = parallax_of(small, K, image_size(left))
     planes = even_planes(views, span, PLANE_STEP_PX, _FEWEST_PLANES, config.planes)
-    return sweep_planes(left, small, K, planes)
+    return sweep_planes(left, small, K, planes, views)
 
 
 @torch.no_grad()

@@ -17,16 +17,18 @@ _CONTRAST = 6.0 / 255.0
 VOTE_LEVELS = 7
 #: The cost of two descriptors that differ in everything: 224.
 COST_LEVELS = 2 * VOTE_LEVELS * SIDE * SIDE
+#: Levels of ``grey_levels`` from black to white.
+GREY_LEVELS = VOTE_LEVELS / _CONTRAST
 # Weights of red, green and blue (ITU-R BT.601).
 _LUMA = 0.299, 0.587, 0.114
 
 
 def grey(image_01: Tensor) -> Tensor:
-    """Luma ``(1, H, W)`` float32 in [0, 1] of an image ``(3, H, W)``, or of what is grey already."""
+    """Luma ``(..., 1, H, W)`` float32 in [0, 1] of images ``(..., 3, H, W)``, or of what is grey already."""
     image_01 = image_01.float()
-    if image_01.shape[0] == 1:
+    if image_01.shape[-3] == 1:
         return image_01
-    return (image_01 * constant_like(image_01, *_LUMA)[:, None, None]).sum(dim=0, keepdim=True)
+    return (image_01 * constant_like(image_01, *_LUMA)[:, None, None]).sum(dim=-3, keepdim=True)
 
 
 def grey_levels(grey_01: Tensor) -> Tensor:
@@ -34,7 +36,7 @@ def grey_levels(grey_01: Tensor) -> Tensor:
 
     About 1.2 of them are an 8-bit level.
     """
-    return (grey_01 * (VOTE_LEVELS / _CONTRAST)).round().to(torch.int16)
+    return (grey_01 * GREY_LEVELS).round().to(torch.int16)
 
 
 def census(levels: Tensor, out: Tensor | None = None) -> Tensor:

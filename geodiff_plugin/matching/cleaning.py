@@ -7,8 +7,12 @@ de-noising"); the quantisation table is K.1 of ITU-T T.81.
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections import defaultdict
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -46,6 +50,8 @@ _LEAST_FIT = 0.5
 _MOST_BLOCK_EDGE = 8.0
 # Noise is read from the finest coefficients of the flattest blocks, of which this is the share.
 _FLATTEST = 0.1
+# The finest coefficients.
+_FINE = tuple((i, j) for i in range(_BLOCK // 2, _BLOCK) for j in range(_BLOCK // 2, _BLOCK))
 # These contain less of it than the others: the factor is that of normally distributed noise.
 _NOISE_OF_FLATTEST = 1.0 / 0.77
 # Noise below the first number of grey levels does not disturb the matching and may be fine texture; noise
@@ -63,19 +69,20 @@ _SHIFTS = tuple((i, (3 * i + k) % _BLOCK) for i in range(_BLOCK) for k in (0, _B
 _SHRUNK = 6.0
 
 
-def _basis(like: Tensor) -> Tensor:
+@cache
+def _basis() -> np.ndarray:
     """Orthonormal DCT-II, ``(frequency, pixel)``."""
-    n = torch.arange(_BLOCK, device="cpu", dtype=like.dtype)
-    waves = torch.cos(math.pi * (2 * n[None] + 1) * n[:, None] / (2 * _BLOCK)) * math.sqrt(2 / _BLOCK)
+    n = np.arange(_BLOCK)
+    waves = np.cos(math.pi * (2 * n[None] + 1) * n[:, None] / (2 * _BLOCK)) * math.sqrt(2 / _BLOCK)
     waves[0] /= math.sqrt(2)
-    return to_device_of(like, waves)
+    return waves
 
 
-def _to_blocks(levels: Tensor, basis: Tensor) -> Tensor:
-    """Coefficients ``(h, w, 8, 8)`` of the whole blocks of ``(H, W)``."""
-    rows, columns = (side // _BLOCK for side in levels.shape)
-    whole = levels[: rows * _BLOCK, : columns * _BLOCK]
-    return _transformed(whole.reshape(rows, _BLOCK, columns, _BLOCK), basis).transpose(1, 2)
+@cache
+def _coefficients(places: tuple[tuple[int, int], ...]) -> np.ndarray:
+    """What the 64 pixels of a block are multiplied by for coefficients at (row, column), ``(64, n)``."""
+    waves = [np.outer(_basis()[row], _basis()[column]).ravel() for row, column in places]
+    return np.stack(waves, axis=1).astype(np.float32)
 
 
 def _transformed(blocks: Tensor, basis: Tensor) -> Tensor:
@@ -83,97 +90,130 @@ def _transformed(blocks: Tensor, basis: Tensor) -> Tensor:
     return (basis @ (blocks.reshape(-1, _BLOCK) @ basis.T).view(len(blocks), _BLOCK, -1)).view(blocks.shape)
 
 
-def _table(like: Tensor) -> Tensor:
-    return to_device_of(like, torch.tensor(_LUMA_STEPS, dtype=like.dtype, device="cpu")).view(_BLOCK, _BLOCK)
+def _steps_at_edges(levels: Tensor, axis: int) -> Tensor:
+    """Mean step from the pixels of each of the 8 columns of blocks to the next, ``(N, 8)``; 0 for rows."""
+    steps = levels.diff(dim=axis + 1).abs().clamp_max(_MOST_BLOCK_EDGE).mean(2 - axis)
+    return steps[:, : steps.shape[1] // _BLOCK * _BLOCK].view(len(levels), -1, _BLOCK).mean(1)
 
 
-def _first_edge(levels: Tensor, axis: int) -> Tensor:
-    """Where the blocks begin, ``()`` 0 to 7: a crop begins within one."""
-    steps = levels.diff(dim=axis).abs().clamp_max(_MOST_BLOCK_EDGE).mean(1 - axis)
-    whole = steps[: steps.shape[0] // _BLOCK * _BLOCK].view(-1, _BLOCK).mean(0)
-    return (whole.argmax() + 1) % _BLOCK
+def _noise_energy(levels: Tensor) -> Tensor:
+    """``(N, 1)`` energy of the finest coefficients of the flattest blocks."""
+    rows, columns = (side // _BLOCK for side in levels.shape[1:])
+    whole = levels[:, : rows * _BLOCK, : columns * _BLOCK].reshape(-1, rows, _BLOCK, columns, _BLOCK)
+    blocks = whole.transpose(2, 3).reshape(len(levels), rows * columns, -1)
+    fine = blocks @ to_device_of(levels, _coefficients(_FINE))
+    energy = fine.square().mean(-1).sort(dim=1).values
+    at = _FLATTEST * (energy.shape[1] - 1)
+    before, after = (energy[:, n, None] for n in (math.floor(at), math.ceil(at)))
+    return torch.lerp(before, after, at - math.floor(at))
 
 
-def _jpeg_scale(levels: Tensor, basis: Tensor) -> float:
-    """The largest steps of which the coefficients of a picture are multiples; its blocks begin at (0, 0)."""
-    blocks = _to_blocks(levels, basis).reshape(-1, _BLOCK, _BLOCK)
-    blocks = blocks[:: math.ceil(len(blocks) / _MOST_BLOCKS)]
-    places = torch.tensor([_BLOCK * row + column for row, column in _KEPT], device="cpu")
-    value = blocks.flatten(1)[:, to_device_of(blocks, places)].abs()[..., None]
-    step = torch.arange(2, _MOST_STEP, device=levels.device, dtype=levels.dtype)
-    counts = value > 0.6 * step  # 0 is a multiple of everything
-    number = counts.sum(0)
-    fit = (torch.cos(2 * math.pi * value / step) * counts).sum(0) / number.clamp_min(1)
-    largest = (step * ((fit > _LEAST_FIT) & (number >= _LEAST_VALUES))).amax(-1).cpu()
-    scales = [scale for scale in (largest / _table(largest).flatten()[places]).tolist() if scale > 0]
-    if len(scales) < _LEAST_VOTES:
-        return 0.0
-    middle = sorted(scales)[(len(scales) - 1) // 2]
-    agree = sum(abs(scale / middle - 1.0) < _ALIKE for scale in scales)
-    return middle if agree >= _LEAST_VOTES else 0.0
+class Flaws(NamedTuple):
+    """What is wrong with a photograph."""
+
+    jpeg_scale: float  # steps of its quantisation as a multiple of table K.1: 1 at a quality of 50, .4 at 80
+    noise: float  # standard deviation, levels of 255
 
 
-def _noise_energy(levels: Tensor, basis: Tensor) -> Tensor:
-    """``()`` energy of the finest coefficients of the flattest blocks."""
-    fine = _to_blocks(levels, basis)[..., _BLOCK // 2 :, _BLOCK // 2 :]
-    return torch.quantile(fine.square().mean((-1, -2)).flatten(), _FLATTEST)
+def find_flaws(levels: Tensor) -> list[Flaws]:
+    """How coarsely photographs ``(N, H, W)``, grey levels up to 255, were compressed, and how noisy they are.
 
-
-def find_flaws(image_01: Tensor) -> tuple[float, float]:
-    """How coarsely a photograph was compressed, and how noisy it is (standard deviation, levels of 255).
-
-    The former is the steps of the JPEG quantisation as a multiple of table K.1: 1 at a quality of 50, .4 at
-    80; 0 where no trace of compression remains, as after resampling. A device is waited for twice.
+    The scale is 0 where no trace of compression remains, as after resampling. A device is waited for twice.
     """
-    levels = grey(image_01)[0] * 255.0
-    return _flaws(levels, _basis(levels))
+    found = torch.cat([*(_steps_at_edges(levels, axis) for axis in (0, 1)), _noise_energy(levels)], dim=1)
+    numbers = found.cpu().numpy()
+    # Where the blocks begin, 0 to 7: a crop begins within one.
+    begins = [(numbers[:, at : at + _BLOCK].argmax(1) + 1) % _BLOCK for at in (0, _BLOCK)]
+    scales = _jpeg_scales(levels, np.stack(begins, axis=1))
+    noises = np.sqrt(numbers[:, -1]) * _NOISE_OF_FLATTEST
+    return [Flaws(scale, float(noise)) for scale, noise in zip(scales, noises, strict=True)]
 
 
-def _flaws(levels: Tensor, basis: Tensor) -> tuple[float, float]:
-    """``find_flaws`` of grey levels ``(H, W)``."""
-    edges = [_first_edge(levels, axis).to(levels) for axis in (0, 1)]
-    top, left, energy = torch.stack([*edges, _noise_energy(levels, basis)]).tolist()
-    scale = _jpeg_scale(levels[int(top) :, int(left) :], basis)
-    return scale, math.sqrt(energy) * _NOISE_OF_FLATTEST
+def _jpeg_scales(levels: Tensor, begins: np.ndarray) -> list[float]:
+    """The largest steps of which the coefficients are multiples; blocks begin at ``begins (N, 2)``."""
+    blocks = _some_blocks(levels, begins)
+    value = (blocks @ to_device_of(levels, _coefficients(_KEPT))).abs()[..., None]  # (N, n, kept, 1)
+    step = np.arange(2, _MOST_STEP, dtype=np.float32)
+    least, waves = to_device_of(levels, np.stack([0.6 * step, 2 * math.pi / step]).astype(np.float32))
+    counts = value > least  # 0 is a multiple of everything
+    sums = torch.stack([counts.sum(1), (value * waves).cos_().mul_(counts).sum(1)])  # (2, N, kept, steps)
+    number, fit = sums.cpu().numpy()
+    multiple = (fit > _LEAST_FIT * number.clip(1)) & (number >= _LEAST_VALUES)
+    largest = (step * multiple).max(-1)
+    return [_scale(of_image) for of_image in largest / [_LUMA_STEPS[_BLOCK * i + j] for i, j in _KEPT]]
 
 
-def _threshold(jpeg_scale: float, noise: float, like: Tensor) -> Tensor | None:
+def _some_blocks(levels: Tensor, begins: np.ndarray) -> Tensor:
+    """Pixels ``(N, n, 64)`` of at most ``_MOST_BLOCKS`` blocks; 0 where an image has fewer than others."""
+    rows, columns = ((np.array(levels.shape[1:]) - begins) // _BLOCK).T[..., None]
+    every = np.maximum(1, -(-rows * columns // _MOST_BLOCKS))
+    block = np.arange((-(-rows * columns // every)).max()) * every
+    exists = block < rows * columns
+    row, column = (begins[:, axis, None] + _BLOCK * at for axis, at in enumerate(np.divmod(block, columns)))
+    table = np.stack([np.where(exists, row, 0), np.where(exists, column, 0), exists])
+    row_at, column_at, there = to_device_of(levels, table)
+    image = to_device_of(levels, np.arange(len(levels)))[:, None]
+    windows = levels.unfold(1, _BLOCK, 1).unfold(2, _BLOCK, 1)
+    return windows[image, row_at, column_at].flatten(2) * there[..., None]
+
+
+def _scale(scales: np.ndarray) -> float:
+    """The scale of the table that the coefficients agree on; 0 if too few do."""
+    found = np.sort(scales[scales > 0])
+    if len(found) < _LEAST_VOTES:
+        return 0.0
+    middle = float(found[(len(found) - 1) // 2])
+    return middle if (np.abs(found / middle - 1.0) < _ALIKE).sum() >= _LEAST_VOTES else 0.0
+
+
+def _threshold(flaws: Flaws) -> np.ndarray | None:
     """Size ``(8, 8)`` below which coefficients are removed; ``None`` where nothing is to be removed."""
     low, high = _NOISE_RANGE
-    noise *= min(max((noise - low) / (high - low), 0.0), 1.0)
-    if not jpeg_scale and not noise:
+    noise = flaws.noise * min(max((flaws.noise - low) / (high - low), 0.0), 1.0)
+    if not flaws.jpeg_scale and not noise:
         return None
-    threshold = torch.hypot(_STEPS * jpeg_scale * _table(like), like.new_full((), _DEVIATIONS * noise))
+    table = np.array(_LUMA_STEPS).reshape(_BLOCK, _BLOCK)
+    threshold = np.hypot(_STEPS * flaws.jpeg_scale * table, _DEVIATIONS * noise)
     threshold[0, 0] = 0.0  # the mean of a block is always kept
-    return threshold
+    return threshold.astype(np.float32)
 
 
 @torch.no_grad()
-def clean(image_01: Tensor, grid_pixels: int) -> Tensor:
-    """A photograph without the blocks of its compression and without sensor noise.
+def clean(images: Sequence[Tensor], grid_pixels: int) -> list[Tensor]:
+    """Photographs ``(3, H, W)``, or grey, without the blocks of their compression and sensor noise.
 
     Blocks stand at the same columns of both images, so that faint texture matches at shifts of 8 pixels;
     noise hides it. What is not flawed, or has more than six times ``grid_pixels``, those of the grid that it
-    is compared on, is returned as it is.
+    is compared on, is returned as it is. Flaws of images of one size are looked for together.
     """
-    if image_01.shape[-2] * image_01.shape[-1] > _SHRUNK * grid_pixels:
-        return image_01
-    levels = grey(image_01)[0] * 255.0
-    basis = _basis(levels)
-    threshold = _threshold(*_flaws(levels, basis), levels)
-    if threshold is None:
-        return image_01
+    cleaned = list(images)
+    most, by_shape = _SHRUNK * grid_pixels, defaultdict[torch.Size, list[int]](list)
+    for number, image in enumerate(images):
+        if image.shape[-2] * image.shape[-1] <= most:
+            by_shape[image.shape].append(number)
+    for alike in by_shape.values():
+        levels = grey(torch.stack([images[number] for number in alike]))[:, 0] * 255.0
+        for number, of_image, flaws in zip(alike, levels, find_flaws(levels), strict=True):
+            threshold = _threshold(flaws)
+            if threshold is not None:
+                change = (_without(of_image, threshold) - of_image) / 255.0
+                cleaned[number] = (images[number] + change).clamp(0.0, 1.0)
+    return cleaned
+
+
+def _without(levels: Tensor, threshold: np.ndarray) -> Tensor:
+    """Grey levels ``(H, W)`` without coefficients below a ``threshold (8, 8)``, the mean of all shifts."""
+    basis, least = (to_device_of(levels, each.astype(np.float32)) for each in (_basis(), threshold))
     tall, broad = (side + (-side) % _BLOCK + _BLOCK for side in levels.shape)  # whole blocks, and one more
     sides = _BLOCK, broad - levels.shape[1], _BLOCK, tall - levels.shape[0]
     wide = F.pad(levels[None, None], sides, mode="reflect")[0, 0]
     if launch_bound(levels):  # all at once
-        down, across = to_device_of(levels, torch.tensor(_SHIFTS, device="cpu").T)
-        total = _thresholded(wide, levels.shape, down, across, basis, threshold).sum(0)
-    else:
-        total = torch.zeros_like(levels)
-        for row, column in _SHIFTS:
-            total += _thresholded(wide, levels.shape, row, column, basis, threshold)
-    return (image_01 + (total / len(_SHIFTS) - levels) / 255.0).clamp(0.0, 1.0)
+        down, across = to_device_of(levels, np.array(_SHIFTS).T)
+        return _thresholded(wide, levels.shape, down, across, basis, least).sum(0) / len(_SHIFTS)
+    total = torch.zeros_like(levels)
+    for row, column in _SHIFTS:
+        total += _thresholded(wide, levels.shape, row, column, basis, least)
+    return total / len(_SHIFTS)
 
 
 def _thresholded(

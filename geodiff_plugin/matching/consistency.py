@@ -44,10 +44,10 @@ LEAST_DEVIATION = 0.5
 #: Planes from infinity up to which an error of one plane is so large a share of the inverse depth that the
 #: matches have to be more precise than ``ENOUGH_KNOWN``, in inverse proportion to their number.
 FAR_PLANES = 50.0
-# It grows by this factor at most.
-_MOST_BLUR = 100.0
-# Only every second row of the right view is matched.
-_EVERY_ROW = 2
+#: It grows by this factor at most.
+MOST_BLUR = 100.0
+#: Only every second row of the right view is matched.
+EVERY_ROW = 2
 
 
 def _left_winner(volume: CostVolume, buffers: Buffers) -> Winner:
@@ -73,14 +73,14 @@ def _right_winners(volume: CostVolume, view: AlignedView, buffers: Buffers) -> T
     The costs of the sweep are looked up for each pixel of the right view and aggregated along its edges.
     """
     height, width = volume.size
-    rows, columns = view.sources(height, 1)[:, ::_EVERY_ROW], view.sources(width, 0)
+    rows, columns = view.sources(height, 1)[:, ::EVERY_ROW], view.sources(width, 0)
     if use_kernel(volume.levels):
         from geodiff_plugin.matching import kernels
 
         levels = kernels.looked_up(volume.levels, rows, columns)
     else:
         levels = _looked_up(volume.levels, rows, columns, buffers)
-    return _positions(aggregate(levels, view.grey[::_EVERY_ROW], buffers=buffers))
+    return _positions(aggregate(levels, view.grey[::EVERY_ROW], buffers=buffers))
 
 
 def _looked_up(levels: Tensor, rows: np.ndarray, columns: np.ndarray, buffers: Buffers) -> Tensor:
@@ -118,18 +118,17 @@ def _disagreement(view: AlignedView, other: Tensor, position: Tensor) -> Tensor:
     if view.valid is not None:
         inside = inside & view.valid[row, column]
     # Between two matched rows, their mean: at an edge it agrees with neither.
-    before, after = row // _EVERY_ROW, ((row + _EVERY_ROW - 1) // _EVERY_ROW).clamp_max(len(other) - 1)
+    before, after = row // EVERY_ROW, ((row + EVERY_ROW - 1) // EVERY_ROW).clamp_max(len(other) - 1)
     difference = (0.5 * (other[before, column] + other[after, column]) - position).abs()
     return torch.where(inside, difference, torch.full_like(difference, torch.inf))
 
 
-def _window_mean(gain: Tensor, reach: int) -> Tensor:
-    """Mean ``(H, W)`` over the part of a window of this half width that lies inside the image."""
-    mean = gain[None]
+def _window_mean(maps: Tensor, reach: int) -> Tensor:
+    """Mean of maps ``(N, H, W)`` over the part of a window of this half width that lies inside the image."""
     for window in ((2 * reach + 1, 1), (1, 2 * reach + 1)):
         padding = (window[0] // 2, window[1] // 2)
-        mean = F.avg_pool2d(mean, window, 1, padding, count_include_pad=False)
-    return mean[0]
+        maps = F.avg_pool2d(maps, window, 1, padding, count_include_pad=False)
+    return maps
 
 
 class ViewEvidence(NamedTuple):
@@ -166,7 +165,7 @@ def candidates(volume: CostVolume, views: Sequence[AlignedView]) -> Candidates:
             features = torch.stack([torch.ones_like(margin), (margin + 0.03).log(), cost, differs])
             yield ViewEvidence(features, difference)
 
-    contrast, sharpness = (_window_mean(each, CONTRAST_REACH) for each in (found.gain, found.sharpness))
+    contrast, sharpness = _window_mean(torch.stack([found.gain, found.sharpness]), CONTRAST_REACH)
     inverse_depth = volume.inverse_depth[0] + position * volume.plane_step
     return Candidates(inverse_depth, contrast, sharpness, evidence())
 
@@ -178,6 +177,8 @@ def match_volume(volume: CostVolume) -> Matches:
     Confidence is 0 where no right view agrees, else about the probability that the match is within
     three planes of the truth, by the right view that is most certain of it.
     """
+    if use_kernel(volume.levels):
+        return _match_by_kernels(volume)
     found = candidates(volume, volume.aligned)
     confidence = torch.zeros_like(found.inverse_depth)
     for features, difference in found.views:
@@ -192,9 +193,21 @@ def match_volume(volume: CostVolume) -> Matches:
     return Matches(found.inverse_depth[None], confidence[None], step, deviation[None])
 
 
+def _match_by_kernels(volume: CostVolume) -> Matches:
+    """``match_volume`` with the evidence of a view weighed in one launch."""
+    from geodiff_plugin.matching import kernels
+
+    buffers = Buffers()
+    found = _left_winner(volume, buffers)
+    means = _window_mean(torch.stack([found.gain, found.sharpness]), CONTRAST_REACH)
+    others = [_right_winners(volume, view, buffers) for view in volume.aligned]
+    confidence, deviation, inverse_depth = kernels.weighed(volume, found, means, others)[:, None]
+    return Matches(inverse_depth, confidence, to_device_of(confidence, volume.plane_step), deviation)
+
+
 def _deviation(confidence: Tensor, sharpness: Tensor) -> Tensor:
     """Standard deviation of matches in planes, ``(H, W)``."""
-    blur = LEAST_SHARPNESS / sharpness.clamp_min(LEAST_SHARPNESS / _MOST_BLUR)
+    blur = LEAST_SHARPNESS / sharpness.clamp_min(LEAST_SHARPNESS / MOST_BLUR)
     return ((1.0 - confidence) / DOUBT_OF_A_PLANE).sqrt() * blur.clamp_min(1.0)
 
 
@@ -233,5 +246,4 @@ def _mean_precision(matches: Matches, least_deviation: float) -> Tensor:
         return torch.ones_like(matches.confidence)
     precision = matches.deviation.clamp_min(least_deviation) ** -2 * matches.confidence.clamp_min(1.0)
     precision = torch.where(matches.confidence > 0, precision, torch.zeros_like(precision))
-    mean = torch.stack([_window_mean(of_image[0], KNOWN_REACH)[None] for of_image in precision])
-    return mean / ENOUGH_KNOWN
+    return _window_mean(precision[:, 0], KNOWN_REACH)[:, None] / ENOUGH_KNOWN

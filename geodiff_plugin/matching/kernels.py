@@ -16,8 +16,19 @@ from torch import Tensor
 
 from geodiff_plugin._kernels import launched_on
 from geodiff_plugin.geometry import to_device_of
+from geodiff_plugin.matching.aggregation import JUMP_CONTRAST, JUMP_PENALTY, PATHS, STEP_PENALTY
 from geodiff_plugin.matching.alignment import AlignedView, even_shifts
-from geodiff_plugin.matching.census import COST_LEVELS, MARGIN_PX, SIDE, VOTE_LEVELS, grey_levels
+from geodiff_plugin.matching.census import COST_LEVELS, GREY_LEVELS, MARGIN_PX, SIDE, VOTE_LEVELS
+from geodiff_plugin.matching.consistency import (
+    AGREEMENT_PLANES,
+    DOUBT_OF_A_PLANE,
+    EVERY_ROW,
+    LEAST_CONTRAST,
+    LEAST_SHARPNESS,
+    LOG_ODDS,
+    MOST_BLUR,
+)
+from geodiff_plugin.matching.sweep import CostVolume
 from geodiff_plugin.matching.winner import BESIDE_PLANES, NEVER, PACKED_PLANES, UNSEEN_LEVEL, Winner
 
 # A kernel reads constants of its module only as these.
@@ -26,6 +37,20 @@ _PACKED_PLANES = tl.constexpr(PACKED_PLANES)
 _UNSEEN_LEVEL = tl.constexpr(UNSEEN_LEVEL)
 _BESIDE_PLANES = tl.constexpr(BESIDE_PLANES)
 _COST_LEVELS = tl.constexpr(COST_LEVELS)
+_GREY_LEVELS = tl.constexpr(GREY_LEVELS)
+_STEP_PENALTY = tl.constexpr(STEP_PENALTY)
+_JUMP_PENALTY = tl.constexpr(JUMP_PENALTY)
+_JUMP_CONTRAST = tl.constexpr(JUMP_CONTRAST)
+_LOG_ODDS = tl.constexpr(LOG_ODDS)
+_AGREEMENT_PLANES = tl.constexpr(AGREEMENT_PLANES)
+_LEAST_CONTRAST = tl.constexpr(LEAST_CONTRAST)
+_LEAST_SHARPNESS = tl.constexpr(LEAST_SHARPNESS)
+_MOST_BLUR = tl.constexpr(MOST_BLUR)
+_DOUBT_OF_A_PLANE = tl.constexpr(DOUBT_OF_A_PLANE)
+# A float32 below 2^22 to which this is added keeps no fraction: it is rounded to nearest, halves to even.
+_ROUNDING = tl.constexpr(1.5 * 2.0**23)
+#: Pixels of a program that works on maps.
+PIXELS = 256
 #: Pixels and planes of a program of the sweep.
 COST_BLOCK = 32, 16
 # Samples of the right images that are interpolated at once: 128 MB.
@@ -34,6 +59,20 @@ _SAMPLES_AT_ONCE = 1 << 25
 _PLANES_A_WARP = 256
 # Sums that a program of the winner holds at once, in registers of its four warps.
 _SUMS_AT_ONCE = 1024
+
+
+@triton.jit
+def _rounded(x):
+    return (x + _ROUNDING) - _ROUNDING
+
+
+@triton.jit
+def _lerp(start, end, weight):
+    """``torch.lerp``, which rounds once: float64 holds the product of two float32."""
+    near = weight < 0.5
+    share = tl.where(near, weight, weight - 1.0).to(tl.float64)
+    base = tl.where(near, start, end).to(tl.float64)
+    return (share * (end - start).to(tl.float64) + base).to(tl.float32)
 
 
 @triton.jit
@@ -111,6 +150,53 @@ def paths_kernel(
         path = cost + tl.minimum(tl.minimum(step, path), limit + least) - least
         path = tl.where(used, path, _NEVER)
         tl.atomic_add(total_at + n * total_step, path, mask=used, sem="relaxed")
+
+
+@triton.jit
+def penalties_kernel(
+    grey,
+    penalties,
+    height,
+    width,
+    grey_row,
+    DOWN: tl.constexpr,
+    ACROSS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """The penalty of a jump at BLOCK pixels, on each axis."""
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = pixel < height * width
+    row, column = pixel // width, pixel % width
+    own = tl.load(grey + row * grey_row + column, mask=inside, other=0.0)
+    for axis in tl.static_range(len(DOWN)):
+        other_row, other_column = row - DOWN[axis], column - ACROSS[axis]
+        exists = inside & (other_row >= 0) & (other_column >= 0) & (other_column < width)
+        other = tl.load(grey + other_row * grey_row + other_column, mask=exists, other=0.0)
+        difference = tl.where(exists, tl.abs(own - other), 0.0)
+        flat = tl.div_rn(difference, tl.full([BLOCK], _JUMP_CONTRAST, tl.float32)) + 1.0
+        limit = tl.div_rn(tl.full([BLOCK], 1.0, tl.float32), flat) * _JUMP_PENALTY
+        limit = tl.maximum(limit, 2.0 * _STEP_PENALTY)
+        at = penalties + axis * height * width + pixel
+        tl.store(at, _rounded(limit * _COST_LEVELS).to(tl.int16), mask=inside)
+
+
+def jump_penalties(grey: Tensor, axes: Sequence[tuple[int, int]]) -> Tensor:
+    """``aggregation.jump_penalties``."""
+    height, width = grey.shape
+    penalties = torch.empty(len(axes), height, width, dtype=torch.int16, device=grey.device)
+    launched_on(grey, penalties_kernel[(triton.cdiv(height * width, PIXELS),)])(
+        grey,
+        penalties,
+        height,
+        width,
+        grey.stride(0),
+        DOWN=tuple(down for down, _ in axes),
+        ACROSS=tuple(across for _, across in axes),
+        BLOCK=PIXELS,
+        num_warps=4,
+        enable_fp_fusion=False,
+    )
+    return penalties
 
 
 def path_warps(planes: int) -> int:
@@ -242,17 +328,75 @@ def _winner(total: Tensor, evidence: tuple[Tensor, Tensor] | None) -> list[Tenso
 
 
 @triton.jit
+def resample_kernel(
+    grey,
+    lines,
+    levels,
+    images,
+    rows,
+    columns,
+    height,
+    width,
+    grey_row,
+    BLOCK: tl.constexpr,
+):
+    """Grey levels of BLOCK pixels of an image, bilinear at its row of ``lines``: rows, then columns."""
+    pixel, image = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK), tl.program_id(1)
+    inside = pixel < rows * columns
+    row = tl.load(lines + image * rows + pixel // columns, mask=inside, other=0.0)
+    column = tl.load(lines + images * rows + image * columns + pixel % columns, mask=inside, other=0.0)
+    row = tl.minimum(tl.maximum(row, 0.0), height - 1.0)
+    column = tl.minimum(tl.maximum(column, 0.0), width - 1.0)
+    top, left = tl.floor(row), tl.floor(column)
+    down, across = row - top, column - left
+    above, before = grey + top.to(tl.int32) * grey_row, left.to(tl.int32)
+    below = grey + tl.minimum(top + 1.0, height - 1.0).to(tl.int32) * grey_row
+    behind = tl.minimum(left + 1.0, width - 1.0).to(tl.int32)
+    first = _lerp(tl.load(above + before, mask=inside), tl.load(below + before, mask=inside), down)
+    second = _lerp(tl.load(above + behind, mask=inside), tl.load(below + behind, mask=inside), down)
+    value = _rounded(_lerp(first, second, across) * _GREY_LEVELS)
+    tl.store(levels + image.to(tl.int64) * rows * columns + pixel, value.to(tl.int16), mask=inside)
+
+
+def _resampled(grey: Tensor, rows: np.ndarray, columns: np.ndarray) -> Tensor:
+    """``alignment._resampled`` of several images at once: ``rows (n, h)``, ``columns (n, w)``."""
+    images, height, width = len(rows), rows.shape[1], columns.shape[1]
+    levels = torch.empty(images, height, width, dtype=torch.int16, device=grey.device)
+    lines = to_device_of(grey, np.concatenate([rows.ravel(), columns.ravel()]))
+    launched_on(grey, resample_kernel[(triton.cdiv(height * width, PIXELS), images)])(
+        grey,
+        lines,
+        levels,
+        images,
+        height,
+        width,
+        *grey.shape,
+        grey.stride(0),
+        BLOCK=PIXELS,
+        num_warps=4,
+        enable_fp_fusion=False,
+    )
+    return levels
+
+
+@triton.jit
 def census_cost_kernel(
     left,
     right,
     starts,
-    cost_out,
+    lines,
+    valid,
+    levels_out,
+    seen_out,
     planes,
     pixels,
+    height,
     width,
     left_row,
     right_row,
-    cost_pixel,
+    valid_row,
+    planes_in_all,
+    HAS_VALID: tl.constexpr,
     SIDE: tl.constexpr,
     MARGIN: tl.constexpr,
     VOTE: tl.constexpr,
@@ -261,7 +405,8 @@ def census_cost_kernel(
 ):
     """Census difference of BLOCK pixels on PLANES planes, from grey levels with a margin.
 
-    ``starts`` say where in ``right`` the first left pixel of each plane lies, margin included.
+    ``starts`` say where in ``right`` the first left pixel of each plane lies, margin included; ``lines
+    (height + width, planes)`` are the lines of the canvas nearest to rows and columns, -1 outside.
     """
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     plane = tl.program_id(1) * PLANES + tl.arange(0, PLANES)
@@ -281,18 +426,30 @@ def census_cost_kernel(
             there = tl.load(other + down * right_row + across, mask=used, other=0).to(tl.int32) - other_centre
             there = tl.minimum(tl.maximum(there, -VOTE), VOTE)
             cost += tl.abs(vote[:, None] - there)
-    at = pixel.to(tl.int64)[:, None] * cost_pixel + plane[None, :]
-    tl.store(cost_out + at, cost.to(tl.uint8), mask=used)
+    at_row = tl.load(lines + row[:, None] * planes_in_all + plane[None, :], mask=used, other=-1)
+    at_column = tl.load(
+        lines + (height + column)[:, None] * planes_in_all + plane[None, :], mask=used, other=-1
+    )
+    seen = (at_row >= 0) & (at_column >= 0)
+    if HAS_VALID:
+        seen &= tl.load(valid + at_row * valid_row + at_column, mask=seen, other=0) != 0
+    at = pixel.to(tl.int64)[:, None] * planes_in_all + plane[None, :]
+    tl.store(levels_out + at, tl.where(seen, cost, _UNSEEN_LEVEL).to(tl.uint8), mask=used)
+    tl.store(seen_out + at, seen, mask=used)
 
 
-def census_costs(left: Tensor, view: AlignedView) -> Tensor:
-    """``alignment.ComparedView.cost`` of all planes, ``(D, H, W)`` uint8.
+def swept(left: Tensor, view: AlignedView) -> tuple[Tensor, Tensor]:
+    """``alignment.ComparedView.cost`` and ``seen`` of all planes, ``(D, H, W)`` uint8 and bool.
 
-    ``left (H + 6, W + 6)`` are ``grey_levels`` of the left view with a margin.
+    ``left (H + 6, W + 6)`` are ``grey_levels`` of the left view with a margin. ``UNSEEN_LEVEL`` stands where
+    the view does not see a plane.
     """
     height, width = (side - 2 * MARGIN_PX for side in left.shape)
     planes, pixels = len(view.scale), height * width
-    cost = torch.empty(height, width, planes, dtype=torch.uint8, device=left.device)
+    levels = torch.empty(height, width, planes, dtype=torch.uint8, device=left.device)
+    in_view = torch.empty_like(levels, dtype=torch.bool)
+    lines = to_device_of(left, _canvas_lines(view, (height, width)))
+    valid = in_view if view.valid is None else view.valid
     at_once = max(1, _SAMPLES_AT_ONCE // (left.shape[0] * view.size[1]))
     for first in range(0, planes, at_once):
         part = range(first, min(planes, first + at_once))
@@ -302,13 +459,19 @@ def census_costs(left: Tensor, view: AlignedView) -> Tensor:
             left,
             right,
             starts,
-            cost[..., first:],
+            lines[:, first:],
+            valid,
+            levels[..., first:],
+            in_view[..., first:],
             len(part),
             pixels,
+            height,
             width,
             left.stride(0),
             right.stride(1),
+            valid.stride(0),
             planes,
+            HAS_VALID=view.valid is not None,
             SIDE=SIDE,
             MARGIN=MARGIN_PX,
             VOTE=VOTE_LEVELS,
@@ -316,7 +479,16 @@ def census_costs(left: Tensor, view: AlignedView) -> Tensor:
             PLANES=COST_BLOCK[1],
             num_warps=4,
         )
-    return cost.permute(2, 0, 1)
+    return levels.permute(2, 0, 1), in_view.permute(2, 0, 1)
+
+
+def _canvas_lines(view: AlignedView, size: tuple[int, int]) -> np.ndarray:
+    """Rows, then columns, of the canvas that the left grid's are nearest to, ``(H + W, D)``; -1 outside."""
+    lines = []
+    for axis in (1, 0):
+        at = view.positions(size[1 - axis], axis)
+        lines.append(np.where(view.inside(at, axis), view.nearest(at, axis), -1))
+    return np.concatenate(lines, axis=1).T.astype(np.int32)
 
 
 def _right_levels(view: AlignedView, size: tuple[int, int], planes: range) -> tuple[Tensor, Tensor]:
@@ -338,46 +510,18 @@ def _right_levels(view: AlignedView, size: tuple[int, int], planes: range) -> tu
         begins = [shifts.begin(plane) for plane in planes]
     area = rows.shape[1] * columns.shape[1]
     starts = [area * image + begin for image, begin in zip(images, begins, strict=True)]
-    levels = _resampled(view.grey, *(to_device_of(view.grey, each) for each in (rows, columns)))
+    levels = _resampled(view.grey, rows, columns)
     return levels, to_device_of(view.grey, np.array(starts, dtype=np.int32))
-
-
-def _resampled(grey: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """``alignment._resampled`` of several images at once: ``rows (n, h)``, ``columns (n, w)``."""
-    last_row, last_column = (side - 1 for side in grey.shape)
-    rows, columns = rows.clamp(0, last_row), columns.clamp(0, last_column)
-    first = rows.floor()
-    after = (first + 1.0).clamp_max(last_row)
-    mixed = torch.lerp(grey[first.long()], grey[after.long()], (rows - first)[..., None])
-    first = columns.floor()
-    around = (first, (first + 1.0).clamp_max(last_column))
-    before, behind = (mixed.gather(2, at.long()[:, None].expand(-1, len(mixed[0]), -1)) for at in around)
-    return grey_levels(torch.lerp(before, behind, (columns - first)[:, None]))
-
-
-def seen(view: AlignedView, size: tuple[int, int]) -> Tensor:
-    """``alignment.ComparedView.seen`` of all planes, ``(D, H, W)`` bool."""
-    lines = view.positions(size[0], 1), view.positions(size[1], 0)
-    rows, columns = (
-        to_device_of(view.grey, view.inside(at, axis).T) for at, axis in zip(lines, (1, 0), strict=True)
-    )
-    found = rows[:, None] & columns
-    if view.valid is not None:
-        row, column = (
-            to_device_of(view.grey, view.nearest(at, axis).T) for at, axis in zip(lines, (1, 0), strict=True)
-        )
-        found &= view.valid[row[:, None], column]
-    return found.permute(2, 0, 1)
 
 
 @triton.jit
 def look_up_kernel(
     levels,
-    rows,
-    columns,
+    lines,
     found,
     planes,
     pixels,
+    height,
     width,
     levels_height,
     levels_width,
@@ -387,12 +531,12 @@ def look_up_kernel(
     BLOCK: tl.constexpr,
     PLANES: tl.constexpr,
 ):
-    """Costs of BLOCK pixels on PLANES planes at their ``rows (h, D)`` and ``columns (w, D)``."""
+    """Costs of BLOCK pixels on PLANES planes, at their rows and columns in ``lines (height + width, D)``."""
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[:, None]
     plane = tl.program_id(1) * PLANES + tl.arange(0, PLANES)[None, :]
     used = (pixel < pixels) & (plane < planes)
-    row = tl.load(rows + (pixel // width) * planes + plane, mask=used, other=0)
-    column = tl.load(columns + (pixel % width) * planes + plane, mask=used, other=0)
+    row = tl.load(lines + (pixel // width) * planes + plane, mask=used, other=0)
+    column = tl.load(lines + (height + pixel % width) * planes + plane, mask=used, other=0)
     shown = used & (row < levels_height) & (column < levels_width)
     at = row.to(tl.int64) * levels_row + column.to(tl.int64) * levels_column + plane * levels_plane
     cost = tl.load(levels + at, mask=shown, other=_UNSEEN_LEVEL)
@@ -404,14 +548,15 @@ def looked_up(levels: Tensor, rows: np.ndarray, columns: np.ndarray) -> Tensor:
     planes, *size = levels.shape
     height, width = rows.shape[1], columns.shape[1]
     found = torch.empty(height, width, planes, dtype=levels.dtype, device=levels.device)
-    at = (to_device_of(levels, each.T.astype(np.int32)) for each in (rows, columns))
+    lines = to_device_of(levels, np.concatenate([rows, columns], axis=1).T.astype(np.int32))
     grid = triton.cdiv(height * width, COST_BLOCK[0]), triton.cdiv(planes, COST_BLOCK[1])
     launched_on(levels, look_up_kernel[grid])(
         levels,
-        *at,
+        lines,
         found,
         planes,
         height * width,
+        height,
         width,
         *size,
         *levels.stride(),
@@ -420,3 +565,116 @@ def looked_up(levels: Tensor, rows: np.ndarray, columns: np.ndarray) -> Tensor:
         num_warps=4,
     )
     return found.permute(2, 0, 1)
+
+
+@triton.jit
+def weigh_kernel(
+    position_in,
+    best_in,
+    runner_up_in,
+    contrast_in,
+    sharpness_in,
+    other,
+    warp,
+    valid,
+    made,
+    planes,
+    pixels,
+    width,
+    other_rows,
+    other_row,
+    canvas_height,
+    canvas_width,
+    valid_row,
+    first_inverse_depth,
+    plane_step,
+    sum_unit,
+    FIRST: tl.constexpr,
+    HAS_VALID: tl.constexpr,
+    EVERY_ROW: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """What a right view says about the winners of BLOCK pixels, and by it and those before their result.
+
+    ``made`` are confidence, deviation and inverse depth; ``warp (3, planes)`` is the scale of every plane,
+    and its shift along columns and rows.
+    """
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    used = pixel < pixels
+    row, column = (pixel // width).to(tl.float32), (pixel % width).to(tl.float32)
+    position = tl.load(position_in + pixel, mask=used, other=0.0)
+    below = tl.minimum(tl.maximum(tl.floor(position).to(tl.int32), 0), planes - 2)
+    part = position - below.to(tl.float32)
+    scale = _lerp(tl.load(warp + below), tl.load(warp + below + 1), part)
+    to_side = _lerp(tl.load(warp + planes + below), tl.load(warp + planes + below + 1), part)
+    down = _lerp(tl.load(warp + 2 * planes + below), tl.load(warp + 2 * planes + below + 1), part)
+    at_column, at_row = _rounded(scale * column + to_side), _rounded(scale * row + down)
+    inside = used & (scale > 0) & (at_column >= 0) & (at_column <= canvas_width - 1)
+    inside &= (at_row >= 0) & (at_row <= canvas_height - 1)
+    there = tl.where(inside, at_column, 0.0).to(tl.int32)
+    line = tl.where(inside, at_row, 0.0).to(tl.int32)
+    if HAS_VALID:
+        inside &= tl.load(valid + line * valid_row + there, mask=inside, other=0) != 0
+    before, after = line // EVERY_ROW, tl.minimum((line + EVERY_ROW - 1) // EVERY_ROW, other_rows - 1)
+    there_before = tl.load(other + before * other_row + there, mask=inside, other=0.0)
+    there_after = tl.load(other + after * other_row + there, mask=inside, other=0.0)
+    difference = tl.where(inside, tl.abs(0.5 * (there_before + there_after) - position), float("inf"))
+
+    best = tl.load(best_in + pixel, mask=used, other=0.0)
+    runner_up = tl.load(runner_up_in + pixel, mask=used, other=0.0)
+    contrast = tl.load(contrast_in + pixel, mask=used, other=0.0)
+    sharpness = tl.load(sharpness_in + pixel, mask=used, other=0.0)
+    cost = tl.minimum(tl.maximum(best * sum_unit, 0.0), 0.8)
+    margin = tl.minimum(tl.maximum((runner_up - best) * sum_unit, 0.0), 0.5)
+    odds = tl.log(margin + 0.03) * _LOG_ODDS[1] + _LOG_ODDS[0] + cost * _LOG_ODDS[2]
+    odds += tl.minimum(difference, _AGREEMENT_PLANES) * _LOG_ODDS[3]
+    probability = tl.sigmoid(odds) * tl.minimum(contrast / _LEAST_CONTRAST, 1.0)
+    confidence = tl.where(difference <= _AGREEMENT_PLANES, probability, 0.0)
+    if not FIRST:
+        confidence = tl.maximum(confidence, tl.load(made + pixel, mask=used, other=0.0))
+    blur = 1.0 / tl.maximum(sharpness / _LEAST_SHARPNESS, 1.0 / _MOST_BLUR)
+    deviation = tl.sqrt((1.0 - confidence) / _DOUBT_OF_A_PLANE) * tl.maximum(blur, 1.0)
+    tl.store(made + pixel, confidence, mask=used)
+    tl.store(made + pixels + pixel, deviation, mask=used)
+    tl.store(made + 2 * pixels + pixel, first_inverse_depth + position * plane_step, mask=used)
+
+
+def weighed(volume: CostVolume, found: Winner, means: Tensor, others: Sequence[Tensor]) -> Tensor:
+    """Confidence, deviation and inverse depth of ``consistency.match_volume``, ``(3, H, W)``.
+
+    ``found`` are the winners of the left view, ``means (2, H, W)`` their contrast and sharpness, and
+    ``others`` the winners of the right views.
+    """
+    made = torch.empty(3, *volume.size, dtype=torch.float32, device=means.device)
+    pixels = volume.size[0] * volume.size[1]
+    for number, (view, other) in enumerate(zip(volume.aligned, others, strict=True)):
+        warp = np.concatenate([view.scale[None], view.shift.T]).astype(np.float32)
+        valid = made if view.valid is None else view.valid
+        launched_on(made, weigh_kernel[(triton.cdiv(pixels, PIXELS),)])(
+            found.position,
+            found.best,
+            found.runner_up,
+            means[0],
+            means[1],
+            other,
+            to_device_of(made, warp),
+            valid,
+            made,
+            len(view.scale),
+            pixels,
+            volume.size[1],
+            len(other),
+            other.stride(0),
+            *view.size,
+            valid.stride(0),
+            float(volume.inverse_depth[0]),
+            float(volume.plane_step),
+            1.0 / (PATHS * COST_LEVELS),
+            FIRST=number == 0,
+            HAS_VALID=view.valid is not None,
+            EVERY_ROW=EVERY_ROW,
+            BLOCK=PIXELS,
+            num_warps=4,
+            enable_fp_fusion=False,
+        )
+    return made

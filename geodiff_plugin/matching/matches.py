@@ -88,22 +88,20 @@ class Matches:
 
 
 def read_above(*wanted: tuple[Matches, float]) -> None:
-    """Fill the caches of ``Matches.above``, for matches on one device, which is waited for once in all."""
-    masks = [matches.confidence.flatten() > confidence for matches, confidence in wanted]
-    if launch_bound(masks[0]):
-        counts = torch.stack([mask.sum() for mask in masks]).tolist()
-        found = [_indices(mask, count) for mask, count in zip(masks, counts, strict=True)]
-    else:
-        found = [mask.nonzero()[:, 0] for mask in masks]
+    """Fill the caches of ``Matches.above``, for matches on grids of one size; a device is waited for once."""
+    masks = torch.stack([matches.confidence.flatten() > confidence for matches, confidence in wanted])
+    found = _indices(masks) if launch_bound(masks) else [mask.nonzero()[:, 0] for mask in masks]
     for (matches, confidence), indices in zip(wanted, found, strict=True):
         matches._above[confidence] = indices
 
 
-def _indices(mask: Tensor, count: int) -> Tensor:
-    """As ``mask.nonzero()[:, 0]`` of a mask ``(N,)`` that is true ``count`` times, without waiting for it."""
-    place = torch.where(mask, mask.cumsum(0), 0)  # what is not there goes to place 0, which is cut off
-    indices = place.new_empty(count + 1)
-    return indices.scatter_(0, place, torch.arange(len(mask), device=mask.device))[1:]
+def _indices(masks: Tensor) -> list[Tensor]:
+    """As ``mask.nonzero()[:, 0]`` of every mask of ``(K, N)``; only their numbers are waited for."""
+    count = masks.cumsum(1)
+    place = torch.where(masks, count, 0)  # what is not there goes to place 0, which is cut off
+    indices = count.new_empty(len(masks), masks.shape[1] + 1)
+    indices.scatter_(1, place, torch.arange(masks.shape[1], device=masks.device).expand_as(place))
+    return [row[1 : 1 + number] for row, number in zip(indices, count[:, -1].tolist(), strict=True)]
 
 
 def points_to_matches(

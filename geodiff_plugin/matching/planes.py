@@ -5,6 +5,7 @@ Cameras are few numbers, so all of this is NumPy on the CPU in float64.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,12 +20,13 @@ from geodiff_plugin.types import CameraView
 SAMPLES = 1024
 #: A smaller shift cannot be measured, pixels.
 LEAST_SHIFT_PX = 0.3
-#: Decimal exponent of an inverse depth in 1/m at which nothing shifts, above which a shift is sought.
-NEVER_SHIFTED = -8.0
-#: Decimal exponent of one at which all shifts are largest, below which it is sought.
-FULLY_SHIFTED = 5.0
-#: Halvings of the distance between these two exponents, which reach 0.05 %.
-HALVINGS = 16
+#: Decimal exponent of an inverse depth in 1/m at which nothing shifts.
+NEVER_SHIFTED = -8
+#: Decimal exponent of one at which all shifts are largest.
+FULLY_SHIFTED = 5
+#: Inverse depths are rounded up to one of so many steps of the exponent between the two, of 0.05 %: rounding
+#: errors of cameras then move no plane.
+STEPS = 1 << 16
 
 
 def _matrix(matrix: Tensor) -> np.ndarray:
@@ -44,10 +46,12 @@ class Parallax:
         y = (row - K[1, 2]) / K[1, 1]
         x = (column - K[0, 2]) / K[0, 0] - K[0, 1] / K[0, 0] * y
         infinity = K_r @ T[:3, :3] @ np.stack([x, y, np.ones_like(x)])
-        #: The left camera's centre, a homogeneous right pixel, (3, 1).
-        self.centre: np.ndarray = K_r @ T[:3, 3:]
-        self._infinity, self._name = infinity[:, infinity[2] > NEAREST_M], name
-        self._uv = self._infinity[:2] / self._infinity[2]
+        infinity = infinity[:, infinity[2] > NEAREST_M]
+        centre = K_r @ T[:3, 3:]  # of the left camera: a pixel goes from the one to the other
+        # On a plane of inverse depth w it has moved by w * way / (far + w * ahead).
+        self._far, self._ahead = infinity[2], float(centre[2, 0])
+        self._way = np.hypot(*(centre[:2] - infinity[:2] / infinity[2] * self._ahead))
+        self._name = name
 
     def median_shift(self, inverse_depth: float) -> float:
         """Pixels by which the median pixel moves from infinity to a plane, 1/m.
@@ -55,30 +59,35 @@ class Parallax:
         A rotation, which moves all depths alike, does not count. Infinite where the plane passes behind the
         right camera. ``InputError`` where no pixel's point at infinity is in front of that camera.
         """
-        if not self._infinity.size:
+        if not self._far.size:
             expected, got = "a pose under which the views overlap", "a right camera that looks the other way"
             bad_value(self._name, expected, got)
-        p = self._infinity + inverse_depth * self.centre  # the line in z, divided by z
-        in_front = p[2] > NEAREST_M
-        shift = np.hypot(*(p[:2] / np.where(in_front, p[2], 1.0) - self._uv))
+        z = self._far + inverse_depth * self._ahead
+        in_front = z > NEAREST_M
+        shift = np.where(in_front, inverse_depth * self._way / np.where(in_front, z, 1.0), np.inf)
         middle = (len(shift) - 1) // 2
-        return float(np.partition(np.where(in_front, shift, np.inf), middle)[middle])
+        return float(np.partition(shift, middle)[middle])
 
     def inverse_depth_at(self, shift_px: float) -> float:
-        """The inverse depth, 1/m within 1 %, at which ``median_shift`` reaches ``shift_px`` > 0.
+        """The inverse depth, 1/m within 0.05 %, at which ``median_shift`` reaches ``shift_px`` > 0.
 
         If one camera stands behind the other, pixels move to the epipole at most, so ``shift_px`` is bounded
         by half of that way. ``InputError`` where both cameras stand at one place.
         """
-        low, high = NEVER_SHIFTED, FULLY_SHIFTED
-        most = self.median_shift(10.0**high)
+        most = self.median_shift(10.0**FULLY_SHIFTED)
         if most < LEAST_SHIFT_PX:
             bad_value(self._name, "a pose with a baseline", "both cameras at one place")
         shift_px = min(shift_px, 0.5 * most)
-        for _ in range(HALVINGS):  # the shift grows with inverse depth
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if self.median_shift(10.0**middle) >= shift_px else (middle, high)
-        return 10.0**high
+        slope = self._way - shift_px * self._ahead
+        reached = np.full_like(slope, np.inf)  # by every pixel; with slope <= 0 never
+        np.divide(shift_px * self._far, slope, out=reached, where=slope > 0)
+        if self._ahead < 0:  # or it passes behind the right camera before
+            reached = np.minimum(reached, (self._far - NEAREST_M) / -self._ahead)
+        middle = len(reached) // 2  # half of them have moved as far, the median as ``median_shift`` has it
+        exponent = math.log10(float(np.partition(reached, middle)[middle]))
+        span = FULLY_SHIFTED - NEVER_SHIFTED
+        step = max(1, math.ceil((exponent - NEVER_SHIFTED) / span * STEPS))
+        return 10.0 ** (NEVER_SHIFTED + span * step / STEPS)
 
 
 def parallax_of(rights: Sequence[CameraView], K_left: Tensor, size: tuple[int, int]) -> tuple[Parallax, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geodiff_plugin.geometry import image_size, is_rectified, resize_image
+from geodiff_plugin.geometry import image_size, is_rectified, resize_image, to_device_of
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.types import CameraView, PosedViews
 
@@ -98,8 +98,8 @@ def match_rectified(native: PosedViews, nearest: Tensor) -> RowMatches | None:
     size = grid_of_rows(native.size)
     left, K = resize_image(native.left_01.float(), native.K_left.float(), size)
     right = CameraView(*resize_image(view.image_01.float(), view.K.float(), size), view.T_right_from_left)
-    baseline_m = view.T_right_from_left[0, 3].abs()
-    return match_rows(left, right, K, float(nearest) * float(K[0, 0] * baseline_m))
+    focal_baseline = float(K[0, 0]) * abs(float(view.T_right_from_left[0, 3]))
+    return match_rows(left, right, K, float(nearest) * focal_baseline)
 
 
 def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: float) -> RowMatches:
@@ -107,9 +107,11 @@ def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: fl
 
     ``nearest_px`` is the largest shift of the search.
     """
-    images = [(grey(image) * 255.0).round().byte()[0].cpu().numpy() for image in (left_01, view.image_01)]
-    infinity = float(K_left[0, 2] - view.K[0, 2])
-    mirrored = float(view.T_right_from_left[0, 3]) > 0
+    levels = grey(torch.stack([left_01, view.image_01]))[:, 0] * 255.0
+    images = list(levels.round().byte().cpu().numpy())
+    K, K_right, T = (each.detach().cpu().numpy() for each in (K_left, view.K, view.T_right_from_left))
+    infinity = float(K[0, 2] - K_right[0, 2])
+    mirrored = T[0, 3] > 0
     if mirrored:  # mirrored, a view to the left becomes one to the right
         images, infinity = [image[:, ::-1] for image in images], -infinity
     width = images[0].shape[1]
@@ -122,8 +124,6 @@ def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: fl
     known = (raw > 16 * (lowest - 1)) & (shift >= MIN_SHIFT_PX)
     between = np.logical_or.accumulate(known, 1) & np.logical_or.accumulate(known[:, ::-1], 1)[:, ::-1]
     shift = np.nan_to_num(fill_background(np.where(known, shift, np.float32(np.nan))))
-    maps = [
-        torch.from_numpy(each[:, ::-1].copy() if mirrored else each).to(left_01.device)
-        for each in (shift, known.astype(np.float32), (between & ~known).astype(np.float32))
-    ]
-    return RowMatches(maps[0], maps[1], maps[2], view.T_right_from_left[0, 3].abs())
+    maps = np.stack([shift, known, between & ~known])
+    shift_on, matched, filled = to_device_of(left_01, maps[..., ::-1] if mirrored else maps)
+    return RowMatches(shift_on, matched, filled, torch.tensor(abs(T[0, 3])))

@@ -46,7 +46,7 @@ class CostVolume:
         """``(H, W)`` of the grid."""
         return self.levels.shape[1], self.levels.shape[2]
 
-    @property
+    @cached_property
     def plane_step(self) -> Tensor:
         """``()`` float32, 1/m between neighbouring planes."""
         return self.inverse_depth[1] - self.inverse_depth[0]
@@ -60,13 +60,18 @@ class CostVolume:
 
 @torch.no_grad()
 def sweep_planes(
-    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, inverse_depth: Tensor
+    left_01: Tensor,
+    rights: Sequence[CameraView],
+    K_left: Tensor,
+    inverse_depth: Tensor,
+    parallax: tuple[Parallax, ...] | None = None,
 ) -> CostVolume:
     """Compare the left view ``(1, H, W)``, grey in [0, 1], with the right views on every plane.
 
     Images keep their resolution; the right ones should have about as many pixels per radian. A cost is the
     mean over the views that see the pixel. ``inverse_depth (D,)`` 1/m is ascending and even, D >= 2. The
     reference computes planes one by one, so that memory is that of the result, two bytes per pixel and plane.
+    ``parallax`` is ``parallax_of`` these views, where it is known already.
     """
     size, planes, K = image_size(left_01), inverse_depth.cpu(), K_left.cpu()
     aligned = tuple(align_view(right, K_left, size, planes) for right in rights)
@@ -74,7 +79,8 @@ def sweep_planes(
     compare = _all_planes if use_kernel(left) else _plane_by_plane
     levels, in_view = compare(left, aligned)
     rectified = all(bool(is_rectified(K, K_right, T)) for _, K_right, T in rights)
-    return CostVolume(levels, in_view, planes, left_01, aligned, parallax_of(rights, K, size), rectified)
+    parallax = parallax or parallax_of(rights, K, size)
+    return CostVolume(levels, in_view, planes, left_01, aligned, parallax, rectified)
 
 
 def _plane_by_plane(left: Tensor, views: Sequence[AlignedView]) -> tuple[Tensor, Tensor]:
@@ -96,13 +102,15 @@ def _all_planes(left: Tensor, views: Sequence[AlignedView]) -> tuple[Tensor, Ten
     """``_plane_by_plane`` by the kernel, all planes at once."""
     from geodiff_plugin.matching import kernels
 
-    costs = [kernels.census_costs(left, view) for view in views]
-    seen = [kernels.seen(view, image_size(costs[0])) for view in views]
-    cost, in_view = (costs[0], seen[0]) if len(views) == 1 else _mean(costs, seen)
+    swept = [kernels.swept(left, view) for view in views]
+    if len(swept) == 1:
+        return swept[0]
+    costs, seen = zip(*swept, strict=True)
+    cost, in_view = _mean(costs, seen)
     return torch.where(in_view, cost, UNSEEN_LEVEL), in_view
 
 
-def _mean(costs: list[Tensor], seen: list[Tensor]) -> tuple[Tensor, Tensor]:
+def _mean(costs: Sequence[Tensor], seen: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """Mean cost over the views that see a pixel, uint8, and whether any does."""
     total, count = (torch.zeros_like(costs[0], dtype=torch.float32) for _ in range(2))
     for cost, of_view in zip(costs, seen, strict=True):

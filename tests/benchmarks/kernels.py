@@ -26,6 +26,7 @@ from geodiff_plugin.algorithm import kernels as algorithm
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.matching import kernels as matching
 from geodiff_plugin.matching.census import MARGIN_PX, SIDE, VOTE_LEVELS
+from geodiff_plugin.matching.consistency import EVERY_ROW
 from geodiff_plugin.result import kernels as result
 from geodiff_plugin.runtime import kernels as runtime
 from geodiff_plugin.scale import kernels as scale
@@ -74,10 +75,21 @@ def _of_the_matching() -> Iterator[Compiled]:
         yield Compiled(name, matching.winner_kernel, winner, sizes, 4)
     block = dict(zip(("BLOCK", "PLANES"), matching.COST_BLOCK, strict=True))
     census = {"SIDE": SIDE, "MARGIN": MARGIN_PX, "VOTE": VOTE_LEVELS}
-    sweep = "*i16 *i16 *i32 *u8" + 6 * " i32"
-    yield Compiled("sweep", matching.census_cost_kernel, sweep, census | block, 4)
-    look_up = "*u8 *i32 *i32 *u8" + 8 * " i32"
+    sweep = "*i16 *i16 *i32 *i32 *i1 *u8 *i1" + 8 * " i32"
+    sizes = census | block | {"HAS_VALID": True}
+    yield Compiled("sweep", matching.census_cost_kernel, sweep, sizes, 4)
+    look_up = "*u8 *i32 *u8" + 9 * " i32"
     yield Compiled("costs of a right view", matching.look_up_kernel, look_up, block, 4)
+    exact = {"enable_fp_fusion": False}
+    pixels: dict[str, Any] = {"BLOCK": matching.PIXELS}
+    resample = "*fp32 *fp32 *i16" + 6 * " i32"
+    yield Compiled("shifted right views", matching.resample_kernel, resample, pixels, 4, exact)
+    axes = {"DOWN": (1, 0), "ACROSS": (0, 1)}
+    penalties = "*fp32 *i16 i32 i32 i32"
+    yield Compiled("penalties", matching.penalties_kernel, penalties, axes | pixels, 4, exact)
+    weigh = 7 * "*fp32 " + "*i1 *fp32" + 8 * " i32" + 3 * " fp32"
+    sizes = pixels | {"FIRST": False, "HAS_VALID": True, "EVERY_ROW": EVERY_ROW}
+    yield Compiled("evidence of a right view", matching.weigh_kernel, weigh, sizes, 4, exact)
 
 
 def _of_the_networks() -> Iterator[Compiled]:

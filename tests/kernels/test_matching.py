@@ -77,6 +77,18 @@ def test_paths_in_any_direction(device, axes, size):
 
 @drawn(5)
 @given(SIZES, st.integers(0, 99))
+@example((1, 9, 11), 0)
+@example((1, 40, 31), 1)
+def test_penalties_equal_their_reference(device, size, seed):
+    _, _, grey = random_volume(size, seed, device)
+    with without_kernels():
+        expected = jump_penalties(grey, EIGHT)
+    assert torch.equal(jump_penalties(grey, EIGHT), expected)
+    assert torch.equal(jump_penalties(grey[::2], FOUR), jump_penalties(grey[::2].contiguous(), FOUR))
+
+
+@drawn(5)
+@given(SIZES, st.integers(0, 99))
 @example((37, 9, 11), 0)
 @example((600, 3, 4), 1)
 def test_the_winner_equals_its_reference(device, size, seed):
@@ -157,6 +169,7 @@ def test_matches_equal_their_reference(device, names):
         expected = match_volume(sweep_planes(left, views, K, planes))
     torch.testing.assert_close(found.inverse_depth, expected.inverse_depth, rtol=1e-5, atol=1e-7)
     torch.testing.assert_close(found.confidence, expected.confidence, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(found.deviation, expected.deviation, rtol=1e-5, atol=1e-5)
     assert expected.confidence.max() > 0
 
 

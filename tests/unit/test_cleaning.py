@@ -13,6 +13,7 @@ from geodiff_plugin.evidence.prepare import make_evidence
 from geodiff_plugin.formats.lenses import distortion_from_text, undistorted
 from geodiff_plugin.jobs.reading import pinhole
 from geodiff_plugin.matching import build_cost_volume, clean, match_volume
+from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.cleaning import find_flaws
 from geodiff_plugin.types import CameraView
 from tests.scenes import SyntheticPair, render_pair
@@ -43,11 +44,11 @@ def test_noise_is_found_and_removed_and_a_good_photograph_stays_as_it_is(
 ) -> None:
     scene = pair.left.image_01[:channels]
     before = noisy(scene, 6.0)
-    after = clean(before, GRID)
-    assert find_flaws(before)[1] == pytest.approx(6.0, rel=0.25)
+    (after,) = clean([before], GRID)
+    assert find_flaws(255 * grey(before))[0].noise == pytest.approx(6.0, rel=0.25)
     assert float((after - scene).square().mean()) < 0.5 * float((before - scene).square().mean())
-    assert clean(scene, GRID) is scene
-    assert clean(before, before[0].numel() // 6 - 1) is before  # it is shrunk anyway
+    assert clean([scene], GRID)[0] is scene
+    assert clean([before], before[0].numel() // 6 - 1)[0] is before  # it is shrunk anyway
 
 
 @pytest.mark.parametrize("flawed", [lambda x: compressed(x, 40), lambda x: noisy(x, 8.0)])
@@ -61,7 +62,7 @@ def test_fewer_matches_are_wrong(pair: SyntheticPair, flawed) -> None:
         off = ((matches.inverse_depth - truth).abs() / matches.plane_step > 1.5) * matches.confidence
         return float(off[seen].sum() / matches.confidence[seen].sum())
 
-    cleaned = clean(left, GRID), clean(right, GRID)
+    cleaned = clean([left], GRID)[0], clean([right], GRID)[0]
     assert wrong(cleaned) < 0.9 * wrong((left, right))
     view = CameraView(right, pair.K_right.float(), T)
     config = GuidanceConfig(pose="given")
@@ -79,7 +80,9 @@ def test_a_photograph_is_cleaned_before_it_is_undistorted(pair: SyntheticPair) -
         return undistorted(image_01.permute(1, 2, 0).contiguous().numpy(), K, lens)
 
     given = blocky.permute(1, 2, 0).contiguous().numpy()
-    np.testing.assert_array_equal(pinhole(given, K, lens, GuidanceConfig()), straight(clean(blocky, GRID)))
+    np.testing.assert_array_equal(
+        pinhole(given, K, lens, GuidanceConfig()), straight(clean([blocky], GRID)[0])
+    )
     off = GuidanceConfig(clean_photographs=False)
     np.testing.assert_array_equal(pinhole(given, K, lens, off), straight(blocky))
     assert pinhole(given, K, None, GuidanceConfig()) is given

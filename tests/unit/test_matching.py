@@ -14,6 +14,7 @@ from geodiff_plugin.matching import build
 from geodiff_plugin.matching.aggregation import NEVER, Buffers
 from geodiff_plugin.matching.build import pilot_volume
 from geodiff_plugin.matching.census import COST_LEVELS
+from geodiff_plugin.matching.planes import parallax_of
 from tests.benchmarks.matching import textured_pair
 
 SIZE = (96, 144)
@@ -132,6 +133,27 @@ def test_swapped_views_and_inverted_poses_are_told(monkeypatch, turn, at):
     assert not m.inverse_pose_preferred(left, [right], K, matches) and len(asked) == before
     unsure = replace(matches, confidence=0.1 * matches.confidence)
     assert not m.inverse_pose_preferred(left, [right], K, unsure) and len(asked) == before + 2
+
+
+@pytest.mark.parametrize(("turn", "at"), POSES)
+def test_a_plane_is_found_by_the_shift_of_the_median_pixel(turn, at):
+    """Its inverse depth is rounded up to steps of .05 %, and the shift is that of a projection."""
+    _, right, K, _, _ = scene(turn, at)
+    (view,) = parallax_of([right], K, SIZE)
+    for wanted_px in (0.4, 3.0, 10.0):
+        inverse_depth = view.inverse_depth_at(wanted_px)
+        rows, columns = torch.meshgrid(*(torch.arange(n) for n in SIZE), indexing="ij")
+        pixels = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1).double().reshape(-1, 3)
+        rays = pixels @ torch.linalg.inv(K.double()).T
+        places = [
+            rays @ right[2][:3, :3].double().T + w * right[2][:3, 3].double() for w in (0.0, inverse_depth)
+        ]
+        far, near = (p @ right[1].double().T for p in places)
+        shift = (near[:, :2] / near[:, 2:] - far[:, :2] / far[:, 2:]).norm(dim=-1)
+        shift = torch.where(near[:, 2] > 0, shift, math.inf)
+        assert float(shift[::13].median()) == pytest.approx(wanted_px, rel=0.02)
+        assert view.median_shift(inverse_depth) == pytest.approx(wanted_px, rel=2e-3)
+        assert view.median_shift(inverse_depth / 1.001) < wanted_px <= view.median_shift(inverse_depth)
 
 
 def test_errors_name_the_argument():
