@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -16,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.geometry import hidden_in_right, image_size, rays_of, warp_right_to_left
+from geodiff_plugin.geometry import PlaneRays, hidden_in_right, image_size, rays_of, warp_right_to_left
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import AffineState, MetricMap
 from geodiff_plugin.types import PosedViews
@@ -86,9 +87,8 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
     return (2.0 * means + C1) * (2.0 * covariance + C2) / ((squares + C1) * (variances + C2) + 1e-12)
 
 
-def _moments(image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation per sample and channel, ``(B, C, 1, 1)`` each."""
-    total = weight.sum((-2, -1), keepdim=True).clamp_min(1.0)
+def _moments(image: Tensor, weight: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation per sample and channel, ``(B, C, 1, 1)``, by weights of a ``total``."""
     mean = (image * weight).sum((-2, -1), keepdim=True) / total
     square = ((image - mean) ** 2 * weight).sum((-2, -1), keepdim=True) / total
     return mean, (square + BLANK_SPREAD**2).sqrt()
@@ -103,8 +103,9 @@ def match_exposure(warped_01: Tensor, left_01: Tensor, visible: Tensor) -> Tenso
     the paper, which names illumination as a limit.
     """
     weight = visible.to(left_01.dtype)
-    mean_left, spread_left = _moments(left_01, weight)
-    mean_right, spread_right = _moments(warped_01, weight)
+    total = weight.sum((-2, -1), keepdim=True).clamp_min(1.0)
+    mean_left, spread_left = _moments(left_01, weight, total)
+    mean_right, spread_right = _moments(warped_01, weight, total)
     gain = (spread_left / spread_right).clamp(*GAINS)
     matched = mean_left + gain * (warped_01 - mean_right)
     share = F.adaptive_avg_pool2d(weight, CELLS)
@@ -273,7 +274,12 @@ class Objective:
 
     def __init__(self, views: PosedViews, metric: MetricMap, config: GuidanceConfig) -> None:
         self.views, self.metric, self.config = views, metric, config
-        self._rays = [rays_of(views.left_01, views.K_left, K, T) for _, K, T in views.views]  # once a chunk
+
+    @cached_property
+    def _rays(self) -> list[PlaneRays]:
+        """Of every right view; only a loss of photographs needs them."""
+        v = self.views
+        return [rays_of(v.left_01, v.K_left, K, T) for _, K, T in v.views]
 
     def metric_depth(self, x: Tensor, affine: AffineState) -> Tensor:
         """``x (B, 1, h, w)`` resized to the loss grid, then Eq. 16: ``(B, 1, H, W)`` metres."""

@@ -186,7 +186,8 @@ def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
     spread = spread.nan_to_num(LARGEST).clamp_min(SPREAD_FLOOR)
     least = (SPREADS * spread).clamp_min(LEAST_DISTANCE)[:, None, None, None]
     radius = max(1, round(REGION * max(depth_m.shape[-2:])))
-    region = _window_sum(behind * weight, radius) / _window_sum(weight, radius).clamp_min(1.0)
+    behind_in_region, in_region = _window_sum(torch.cat([behind * weight, weight], 1), radius).chunk(2, 1)
+    region = behind_in_region / in_region.clamp_min(1.0)
     rejected = ((torch.minimum(region, behind) / least - 1.0) / (MULTIPLE - 1.0)).clamp(0.0, 1.0)
     return (1.0 - rejected).contiguous()  # the sums lie column by column, which everything after would copy
 

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._kernels import launch_bound
+from geodiff_plugin._kernels import launch_bound, use_kernel
 from geodiff_plugin._strips import STRIP_PIXELS, row_strips
 from geodiff_plugin.algorithm.terms import match_exposure
 from geodiff_plugin.geometry import as_fine_as, image_size, warp_right_to_left
@@ -20,27 +20,27 @@ RIGHT_WITHIN = 0.1
 #: (``python -m tests.benchmarks.confidence`` refits them): constant, certainty, strength of the prior,
 #: photometric agreement, and relative spread of the ensemble (by hand: 10 % quarter the odds).
 BY_EVIDENCE = (-0.228, 0.788, 2.42, 0.0864, -15.0)
-# Below this photometric error images agree as well as their noise lets them.
-_LEAST_DIFFERENCE = 0.01
-# Above this photometric error they do not agree at all.
-_MOST_DIFFERENCE = 0.1
-# A smaller error of the prior, in log depth, makes no difference.
-_STRONG = 0.03
-# Nor does a larger one.
-_WEAK = 0.15
-# A smaller error that is left in a depth makes no difference.
-_LEAST_LEFT = 0.0005
-# Nor does a larger one.
-_MOST_LEFT = 0.05
-# The least error of a prior, in log depth, that matches can measure.
-_BEST = 0.01
-# The error of a useless prior.
-_USELESS = 0.5
+#: Below this photometric error images agree as well as their noise lets them.
+LEAST_DIFFERENCE = 0.01
+#: Above this photometric error they do not agree at all.
+MOST_DIFFERENCE = 0.1
+#: A smaller error of the prior, in log depth, makes no difference.
+STRONG = 0.03
+#: Nor does a larger one.
+WEAK = 0.15
+#: A smaller error that is left in a depth makes no difference.
+LEAST_LEFT = 0.0005
+#: Nor does a larger one.
+MOST_LEFT = 0.05
+#: The least error of a prior, in log depth, that matches can measure.
+BEST = 0.01
+#: The error of a useless prior.
+USELESS = 0.5
 #: Known share of the matches around a pixel from which on they determine what their support says.
 DETERMINED_FROM = 0.33
-# Support at which the prior's error is half known: it is measured where there are matches, and a prior that
-# is right on the street may be wrong on the trees above it.
-_HALF_KNOWN = 0.1
+#: Support at which the prior's error is half known: it is measured where there are matches, and a prior that
+#: is right on the street may be wrong on the trees above it.
+HALF_KNOWN = 0.1
 
 
 def determined(known: Tensor, size: tuple[int, int]) -> Tensor:
@@ -59,15 +59,15 @@ def depth_evidence(
     ``(1 - support) * e``; strength is the log of .15 over e, because wrong matches lose their weight with a
     good prior, while a poor one follows them. Agreement is the log of .1 over the photometric ``error``.
     """
-    agreement = -(error.clamp(_LEAST_DIFFERENCE, _MOST_DIFFERENCE) / _MOST_DIFFERENCE).log()
-    measured = support.new_tensor(_USELESS) if prior_error is None else prior_error.clamp(_BEST, _USELESS)
-    share = support / (support + _HALF_KNOWN)
-    left_to_prior = measured**share * _USELESS ** (1.0 - share)
+    agreement = -(error.clamp(LEAST_DIFFERENCE, MOST_DIFFERENCE) / MOST_DIFFERENCE).log()
+    measured = support.new_tensor(USELESS) if prior_error is None else prior_error.clamp(BEST, USELESS)
+    share = support / (support + HALF_KNOWN)
+    left_to_prior = measured**share * USELESS ** (1.0 - share)
     left = (1.0 - support) * left_to_prior
     evidence = [
         torch.ones_like(support),
-        -(left.clamp(_LEAST_LEFT, _MOST_LEFT) / _MOST_LEFT).log(),
-        -(left_to_prior.clamp(_STRONG, _WEAK) / _WEAK).log(),
+        -(left.clamp(LEAST_LEFT, MOST_LEFT) / MOST_LEFT).log(),
+        -(left_to_prior.clamp(STRONG, WEAK) / WEAK).log(),
         torch.where(visible, agreement, torch.zeros_like(agreement)),
         torch.zeros_like(support) if spread is None else spread,
     ]
@@ -82,11 +82,15 @@ def depth_confidence(
     From the support of ``fit_depth``, the photometric error, the relative spread of an ensemble's members
     (or ``None``), and the prior's ``local_error`` on any grid (``None`` counts as a useless prior).
     """
-    weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
-    confidence = torch.empty_like(support)
     size = image_size(support)
     if prior_error is not None and image_size(prior_error) != (1, 1):
         prior_error = F.interpolate(prior_error, size, mode="nearest-exact")
+    if use_kernel(support):
+        from geodiff_plugin.result import kernels
+
+        return kernels.confidence_of(support, error, visible, spread, prior_error)
+    weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
+    confidence = torch.empty_like(support)
     for rows in row_strips(*size):  # the features take five times as much memory as the result
         shown = [x[:, :, rows] for x in (support, error, visible)]
         further = (None if x is None else x.expand_as(support)[:, :, rows] for x in (spread, prior_error))
@@ -123,6 +127,10 @@ def _warped(
     right_01: Tensor, depth_m: Tensor, K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The right image on the left grid and where it is visible, in strips of rows to spare memory."""
+    if use_kernel(depth_m):
+        from geodiff_plugin.result import kernels
+
+        return kernels.warped(right_01, depth_m, K_left, K_right, T_right_from_left)
     warped = right_01.new_empty((1, right_01.shape[1], *image_size(depth_m)))
     visible = torch.empty_like(depth_m, dtype=torch.bool)
     for rows in row_strips(*image_size(depth_m)):

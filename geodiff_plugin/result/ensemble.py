@@ -30,6 +30,9 @@ def median(x: Tensor, dim: int, lower: bool = False) -> Tensor:
 
     ``torch.median``, and so Marigold-DC, takes the lower, which makes metres too near.
     """
-    ordered, count = x.sort(dim=dim).values, x.shape[dim]
+    count = x.shape[dim]
+    if count == 1:
+        return x.select(dim, 0)
+    ordered = x.sort(dim=dim).values
     below = ordered.select(dim, (count - 1) // 2)
     return below if lower else 0.5 * (below + ordered.select(dim, count // 2))

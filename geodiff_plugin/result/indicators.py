@@ -12,7 +12,7 @@ from torch import Tensor
 
 from geodiff_plugin._strips import row_strips
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.geometry import image_size, is_rectified
+from geodiff_plugin.geometry import constant_like, image_size, is_rectified
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.pose.tracks import LONG_SIDE
@@ -108,7 +108,7 @@ def _measure_matches(matches: Matches, depth_m: Tensor, planes: Tensor | None) -
     in_front = confident & (matches.inverse_depth > 0)
     inverse_depth = _where(matches.inverse_depth, in_front)
     sample = inverse_depth.flatten()[:: max(1, inverse_depth.numel() // MOST_SORTED)]
-    low, high = (torch.nanquantile(sample, share) for share in (0.05, 0.95))
+    low, high = torch.nanquantile(sample, constant_like(sample, 0.05, 0.95)).unbind()
     numbers = {"matched": confident.float().mean(), "in_front": in_front.sum()}
     numbers |= {"spread": (high / low.clamp_min(1e-9)).log(), "planes_apart": (high - low) / step}
     numbers |= {"scene_m": 1.0 / sample.nanmedian()}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 import triton
 import triton.language as tl
@@ -14,7 +15,8 @@ from torch import Tensor
 
 from geodiff_plugin._kernels import launched_on
 from geodiff_plugin.algorithm.edges import HALF, REACH
-from geodiff_plugin.result import voting
+from geodiff_plugin.geometry import EDGE_PX, NEAREST_M, image_size, to_device_of
+from geodiff_plugin.result import confidence, voting
 
 # A kernel reads constants of its module only as these.
 _HALF = tl.constexpr(HALF)
@@ -31,6 +33,20 @@ _NEAR_PX = tl.constexpr(voting.NEAR_PX)
 _ROUNDS = tl.constexpr(voting.ROUNDS)
 _MEDIAN = tl.constexpr(voting.MEDIAN)
 _IN_MEDIAN = tl.constexpr(voting.MEDIAN**2)
+_EDGE_PX = tl.constexpr(EDGE_PX)
+_NEAREST_M = tl.constexpr(NEAREST_M)
+_CONSTANT, _CERTAINTY, _STRENGTH, _AGREEMENT, _SPREAD_COUNTS = map(tl.constexpr, confidence.BY_EVIDENCE)
+_LEAST_DIFFERENCE = tl.constexpr(confidence.LEAST_DIFFERENCE)
+_MOST_DIFFERENCE = tl.constexpr(confidence.MOST_DIFFERENCE)
+_STRONG = tl.constexpr(confidence.STRONG)
+_WEAK = tl.constexpr(confidence.WEAK)
+_LEAST_LEFT = tl.constexpr(confidence.LEAST_LEFT)
+_MOST_LEFT = tl.constexpr(confidence.MOST_LEFT)
+_BEST = tl.constexpr(confidence.BEST)
+_USELESS = tl.constexpr(confidence.USELESS)
+_HALF_KNOWN = tl.constexpr(confidence.HALF_KNOWN)
+#: Pixels of a program that works on each by itself.
+PIXELS = 1024
 #: Pixels of a program whose windows are held at once.
 BLOCK = 64
 #: Warps of such a program.
@@ -130,6 +146,127 @@ def median_kernel(
     most = tl.where(tl.load(map_vote) < 1.0, 1.0, -1.0)
     smoothed = tl.load(confidence + own) <= most
     tl.store(smooth + pixel, tl.where(smoothed, median, tl.load(voted + own)), exists)
+
+
+@triton.jit
+def _in_units(value, least, most):
+    """Minus the log of a value, within bounds, over the upper one."""
+    return -tl.log(tl.minimum(tl.maximum(value, least), most) / most)
+
+
+@triton.jit
+def confidence_kernel(
+    support, error, visible, spread, prior_error, confident, pixels,
+    SPREAD: tl.constexpr, PRIOR: tl.constexpr, PIXELS: tl.constexpr,
+):  # fmt: skip
+    """``confidence.depth_confidence``. Grid: blocks of pixels, maps.
+
+    SPREAD says whether there is one, PRIOR how many errors of the prior a map has: none, 1, or 2 for every
+    pixel its own.
+    """
+    pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    exists, of_map = pixel < pixels, tl.program_id(1)
+    at = of_map.to(tl.int64) * pixels + pixel
+    supported = tl.load(support + at, exists, 0.0)
+    log_useless = tl.log(tl.zeros_like(supported) + _USELESS)
+    if PRIOR == 0:
+        log_measured = log_useless
+    else:
+        where_measured = at if PRIOR == 2 else of_map + tl.zeros_like(pixel)
+        measured = tl.load(prior_error + where_measured, exists, 1.0)
+        log_measured = tl.log(tl.minimum(tl.maximum(measured, _BEST), _USELESS))
+    share = supported / (supported + _HALF_KNOWN)
+    left_to_prior = tl.exp(share * log_measured + (1.0 - share) * log_useless)
+    odds = _in_units((1.0 - supported) * left_to_prior, _LEAST_LEFT, _MOST_LEFT) * _CERTAINTY + _CONSTANT
+    odds += _in_units(left_to_prior, _STRONG, _WEAK) * _STRENGTH
+    agreement = _in_units(tl.load(error + at, exists, 1.0), _LEAST_DIFFERENCE, _MOST_DIFFERENCE)
+    odds += tl.where(tl.load(visible + at, exists, 0) != 0, agreement * _AGREEMENT, 0.0)
+    if SPREAD:
+        odds += tl.load(spread + at, exists, 0.0) * _SPREAD_COUNTS
+    tl.store(confident + at, 1.0 / (1.0 + tl.exp(-odds)), exists)
+
+
+def confidence_of(
+    support: Tensor, error: Tensor, visible: Tensor, spread: Tensor | None, prior_error: Tensor | None
+) -> Tensor:
+    """``confidence.depth_confidence``; ``prior_error`` is a number a map, or has the size of the maps."""
+    maps = [each.contiguous() for each in (support, error, visible)]
+    pixels, confident = support[0].numel(), torch.empty_like(maps[0])
+    further = [maps[0] if each is None else each.float().contiguous() for each in (spread, prior_error)]
+    prior = 0 if prior_error is None else 1 if prior_error[0].numel() == 1 else 2
+    launched_on(support, confidence_kernel[(triton.cdiv(pixels, PIXELS), len(support))])(
+        *maps, *further, confident, pixels, SPREAD=spread is not None, PRIOR=prior, PIXELS=PIXELS
+    )
+    return confident
+
+
+@triton.jit
+def warp_kernel(
+    right, depth_m, cameras, warped, visible, height, width, rows, columns,
+    CHANNELS: tl.constexpr, PIXELS: tl.constexpr,
+):  # fmt: skip
+    """``geometry.warp_right_to_left`` of one image. Grid: blocks of pixels."""
+    pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    exists = pixel < height * width
+    y = ((pixel // width).to(tl.float32) - tl.load(cameras + 1)) / tl.load(cameras + 3)
+    x = ((pixel % width).to(tl.float32) - tl.load(cameras)) / tl.load(cameras + 2)
+    x -= tl.load(cameras + 4) * y
+    z = tl.load(depth_m + pixel, exists, 1.0)
+    to_right = cameras + 5  # three rows of four numbers
+    u = z * (tl.load(to_right + 2) + tl.load(to_right + 1) * y + tl.load(to_right) * x) + tl.load(
+        to_right + 3
+    )
+    to_right += 4
+    v = z * (tl.load(to_right + 2) + tl.load(to_right + 1) * y + tl.load(to_right) * x) + tl.load(
+        to_right + 3
+    )
+    to_right += 4
+    z = z * (tl.load(to_right + 2) + tl.load(to_right + 1) * y + tl.load(to_right) * x) + tl.load(
+        to_right + 3
+    )
+    in_front = z > _NEAREST_M
+    z = tl.where(in_front, z, 1.0)
+    u, v = tl.where(in_front, u / z, -1.0), tl.where(in_front, v / z, -1.0)
+    seen = (
+        (u >= -_EDGE_PX) & (u <= columns - 1.0 + _EDGE_PX) & (v >= -_EDGE_PX) & (v <= rows - 1.0 + _EDGE_PX)
+    )
+    tl.store(visible + pixel, seen & in_front, exists)
+    u, v = tl.minimum(tl.maximum(u, 0.0), columns - 1.0), tl.minimum(tl.maximum(v, 0.0), rows - 1.0)
+    left, top = u.to(tl.int32), v.to(tl.int32)
+    beside, below = tl.minimum(left + 1, columns - 1), tl.minimum(top + 1, rows - 1) * columns
+    across, down = u - left.to(tl.float32), v - top.to(tl.float32)
+    top = top * columns
+    for channel in tl.static_range(CHANNELS):
+        layer = right + channel * rows * columns
+        above = (1.0 - across) * tl.load(layer + top + left) + across * tl.load(layer + top + beside)
+        under = (1.0 - across) * tl.load(layer + below + left) + across * tl.load(layer + below + beside)
+        tl.store(warped + channel * height * width + pixel, (1.0 - down) * above + down * under, exists)
+
+
+def warped(
+    right_01: Tensor, depth_m: Tensor, K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor
+) -> tuple[Tensor, Tensor]:
+    """``confidence._warped``."""
+    K, K_r, T = (
+        each[0].numpy(force=True).astype(np.float64) for each in (K_left, K_right, T_right_from_left)
+    )
+    own = K[0, 2], K[1, 2], K[0, 0], K[1, 1], K[0, 1] / K[0, 0]
+    cameras = np.concatenate([own, (K_r @ T[:3]).ravel()]).astype(np.float32)
+    size, channels = image_size(depth_m), right_01.shape[1]
+    image = right_01.new_empty(1, channels, *size)
+    visible = torch.empty_like(depth_m, dtype=torch.bool)
+    launched_on(depth_m, warp_kernel[(triton.cdiv(depth_m.numel(), PIXELS),)])(
+        right_01.contiguous(),
+        depth_m.contiguous(),
+        to_device_of(depth_m, cameras),
+        image,
+        visible,
+        *size,
+        *image_size(right_01),
+        CHANNELS=channels,
+        PIXELS=PIXELS,
+    )
+    return image, visible
 
 
 def voted(given: voting.Voters, left: Tensor, error: Tensor, map_vote: Tensor) -> Tensor:

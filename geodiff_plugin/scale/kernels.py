@@ -1,4 +1,4 @@
-"""Triton kernel of the scale's refinement, by the reference ``scale.points.refine_to_matches``; its formulas.
+"""Triton kernels of ``scale.space`` and of the scale's refinement, ``scale.points.refine_to_matches``.
 
 This module is imported only where ``use_kernel`` says so, because it imports Triton.
 """
@@ -6,7 +6,9 @@ This module is imported only where ``use_kernel`` says so, because it imports Tr
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+import torch
 import triton
 import triton.language as tl
 from torch import Tensor
@@ -14,7 +16,7 @@ from torch import Tensor
 from geodiff_plugin._kernels import launched_on
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale import points
-from geodiff_plugin.scale.points import KERNEL_FORMS
+from geodiff_plugin.scale.space import FLOOR_EPS, KERNEL_FORMS, SQUARE, MetricMap
 
 # A kernel reads constants of its module only as these.
 _FIT_NOISE = tl.constexpr(points.FIT_NOISE)
@@ -25,6 +27,12 @@ _LEAST_DOUBT = tl.constexpr(points.LEAST_DOUBT)
 _NEAR_FACTOR = tl.constexpr(math.exp(points.NEAR_REACH))
 _FAR_FACTOR = tl.constexpr(math.exp(points.FAR_REACH))
 _FULLEST = tl.constexpr(points.FULLEST)
+_EPS = tl.constexpr(FLOOR_EPS)
+#: Pixels of a program that works on each by itself.
+PIXELS = 1024
+#: What such a program makes of a map.
+FLOORED, METRIC, RELATIVE = 0, 1, 2
+_FLOORED, _METRIC = tl.constexpr(FLOORED), tl.constexpr(METRIC)
 #: Matches of a program that are held at once, at least: fewer would compile another kernel for few matches.
 _LEAST_BLOCK = 1024
 #: Matches whose equations are summed at once, fewer than are searched for their median.
@@ -79,6 +87,43 @@ def ends(near, far, FORM: tl.constexpr):
     else:
         at_zero, at_one = near, far
     return at_zero, at_one
+
+
+@triton.jit
+def floored_of(x, CLIPPED: tl.constexpr):
+    """``space.smooth_floor``, or a map clipped to [0, 1]."""
+    if CLIPPED:
+        floored = tl.minimum(tl.maximum(x, 0.0), 1.0)
+    else:
+        root = tl.sqrt(x * x + 4.0 * _EPS * _EPS)
+        floored = tl.where(x > 0.0, 0.5 * (x + root), 2.0 * _EPS * _EPS / (root - tl.minimum(x, 0.0)))
+    return floored
+
+
+@triton.jit
+def map_kernel(
+    x, scale, shift, unit, made, pixels,
+    MAKES: tl.constexpr, FORM: tl.constexpr, CLIPPED: tl.constexpr, PIXELS: tl.constexpr,
+):  # fmt: skip
+    """``smooth_floor``, ``MetricMap.__call__`` or ``MetricMap.relative``. Grid: blocks of pixels, maps."""
+    pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    exists, of_map = pixel < pixels, tl.program_id(1)
+    at = of_map.to(tl.int64) * pixels + pixel
+    value = tl.load(x + at, exists, 1.0)
+    if MAKES == _FLOORED:
+        value = floored_of(value, CLIPPED)
+    else:
+        s, t, g = tl.load(scale + of_map), tl.load(shift + of_map), tl.load(unit + of_map)
+        if MAKES == _METRIC:
+            value = g * forward(s * floored_of(value, CLIPPED) + t, FORM)
+        else:
+            value = (inverse(value / g, FORM) - t) / s
+            if CLIPPED:
+                value = tl.minimum(tl.maximum(value, 0.0), 1.0)
+            else:
+                value = tl.maximum(value, 0.5 * _EPS)
+                value = value - _EPS * _EPS / value
+    tl.store(made + at, value, exists)
 
 
 @triton.jit
@@ -253,6 +298,38 @@ def refine_kernel(
     near, far = ends(forward(e0, FORM), forward(e1, FORM), FORM)
     tl.store(refined + row, tl.minimum(near, far * _FULLEST))
     tl.store(refined + tl.num_programs(0) + row, far)
+
+
+def _made(x: Tensor, numbers: Sequence[Tensor], makes: int, metric: MetricMap, batch: int = 1) -> Tensor:
+    """A map made of another one, of a ``batch`` of maps, whose scale, shift and unit are ``(B,)``."""
+    x = x.contiguous()
+    made, pixels = torch.empty_like(x), x.numel() // batch
+    launched_on(x, map_kernel[(triton.cdiv(pixels, PIXELS), batch)])(
+        x,
+        *numbers,
+        made,
+        pixels,
+        MAKES=makes,
+        FORM=KERNEL_FORMS[metric.space],
+        CLIPPED=metric.positive == SQUARE,
+        PIXELS=PIXELS,
+    )
+    return made
+
+
+def floored(x: Tensor) -> Tensor:
+    """``space.smooth_floor``."""
+    return _made(x, (x, x, x), FLOORED, MetricMap())
+
+
+def metric_depth(x: Tensor, numbers: Sequence[Tensor], metric: MetricMap) -> Tensor:
+    """``MetricMap.__call__`` with scale, shift and global scale."""
+    return _made(x, numbers, METRIC, metric, len(x))
+
+
+def relative(depth_m: Tensor, numbers: Sequence[Tensor], metric: MetricMap) -> Tensor:
+    """``MetricMap.relative`` with scale, shift and global scale."""
+    return _made(depth_m, numbers, RELATIVE, metric, len(depth_m))
 
 
 def warps(block: int) -> int:

@@ -16,7 +16,7 @@ from torch import Tensor
 from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.matches import UNIT, read_above
-from geodiff_plugin.scale.space import SPACES, SQUARE, MetricMap, Space
+from geodiff_plugin.scale.space import KERNEL_FORMS, SPACES, SQUARE, MetricMap, Space
 
 #: Matches above this confidence are reliable: more likely right than wrong.
 RELIABLE = 0.5
@@ -44,8 +44,6 @@ FIT_NOISE = 0.5
 FIT_FLOOR = 4e-3
 #: Width of the Cauchy weight, in standard deviations of match and map together.
 FIT_CAUCHY = 2.0
-#: Spaces whose formula the kernels have, and its number there; in another one the reference runs.
-KERNEL_FORMS = {"depth": 0, "disparity": 1, "log": 2, "log1p": 3, "sqrt_disparity": 4}
 #: Bound of the change of near in the fit, as a log factor: the fit must stay in its basin.
 NEAR_REACH = 1.4
 #: The same of far.
@@ -247,7 +245,8 @@ def order_agreement(x: Tensor, matches: Matches, space: str) -> Tensor:
     at = at[:: max(1, len(at) // ORDER_SAMPLES)]
     values = _values_at(x, matches.size, at)
     nearness = -values if SPACES[space].grows_with_depth else values
-    return (_ranks(nearness) * _ranks(matches.inverse_depth.flatten()[at])[None]).sum(-1)
+    *of_maps, of_matches = _ranks(torch.cat([nearness, matches.inverse_depth.flatten()[at][None]]))
+    return (torch.stack(of_maps) * of_matches).sum(-1)
 
 
 def _values_at(x: Tensor, size: tuple[int, int], at: Tensor) -> Tensor:

@@ -18,8 +18,8 @@ from geodiff_plugin._kernels import launched_on
 from geodiff_plugin.matching import CostVolume, Matches
 from geodiff_plugin.matching.census import COST_LEVELS
 from geodiff_plugin.scale import points, space, volume_search
-from geodiff_plugin.scale.kernels import ends, forward, inverse, value_at
-from geodiff_plugin.scale.points import KERNEL_FORMS
+from geodiff_plugin.scale.kernels import ends, floored_of, forward, inverse, value_at
+from geodiff_plugin.scale.space import KERNEL_FORMS
 
 # A kernel reads constants of its module only as these.
 _BASIN_CAUCHY = tl.constexpr(points.BASIN_CAUCHY)
@@ -27,7 +27,6 @@ _BASIN_REACH = tl.constexpr(points.BASIN_REACH)
 _COST_CLAMP = tl.constexpr(volume_search.COST_CLAMP)
 _COST_LEVELS = tl.constexpr(COST_LEVELS)
 _LEAST_SHARE = tl.constexpr(space.LEAST_SHARE)
-_FLOOR = tl.constexpr(4.0 * space.FLOOR_EPS**2)
 #: Points, or groups of pixels, that a program holds at once.
 BLOCK = 512
 #: Pixels of a group that a program adds up at once.
@@ -56,17 +55,6 @@ def _log1p(y):
     """The logarithm of 1 + y, exact for a small y >= 0."""
     above = 1.0 + y
     return tl.where(above == 1.0, y, y * tl.log(above) / tl.where(above == 1.0, 1.0, above - 1.0))
-
-
-@triton.jit
-def _floored(x, CLIPPED: tl.constexpr):
-    """``space.smooth_floor``, or a map clipped to [0, 1]."""
-    if CLIPPED:
-        floored = tl.minimum(tl.maximum(x, 0.0), 1.0)
-    else:
-        root = tl.sqrt(x * x + _FLOOR)
-        floored = tl.where(x > 0.0, 0.5 * (x + root), 0.5 * _FLOOR / (root - tl.minimum(x, 0.0)))
-    return floored
 
 
 @triton.jit
@@ -122,7 +110,7 @@ def basin_kernel(
         inside = k < count
         pixel = tl.load(at + k.to(tl.int64) * stride, inside, 0).to(tl.int32)
         v = value_at(x + of_map * rows * columns, pixel, height, width, rows, columns)
-        depth = g * forward(s * _floored(v, CLIPPED) + t, FORM)
+        depth = g * forward(s * floored_of(v, CLIPPED) + t, FORM)
         e = (1.0 / depth - tl.load(map_inverse + pixel)) / width_of_cost
         total += tl.where(inside, _log1p(e * e), 0.0)
     tl.store(cost + into, tl.where(exists, tl.sum(total, 0) / count, float("inf")))

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._checks import check_choice
+from geodiff_plugin._kernels import use_kernel
 
 #: Half-width of the smooth floor, in units of the relative map (whose range is about [0, 1]): so small that a
 #: street from 6 to 330 m gains a third of a metre at its nearest point and nothing elsewhere.
@@ -22,12 +23,22 @@ FLOOR_EPS = 0.001
 LEAST_SHARE = 1e-4
 
 
+def _by_kernel(*tensors: Tensor) -> bool:
+    """Whether a formula of tensors runs by its kernel, which has no gradient and no other type."""
+    with_gradient = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
+    return use_kernel(tensors[0]) and tensors[0].dtype == torch.float32 and not with_gradient
+
+
 def smooth_floor(x: Tensor, eps: float = FLOOR_EPS) -> Tensor:
     """Keep relative values ``x``, about [0, 1] but unbounded, above 0 with a gradient that is never zero.
 
     ``(x + sqrt(x^2 + 4 eps^2)) / 2``, whose slope falls only as ``(eps / x)^2`` below 0, so that a clipped
     pixel can still be pulled back (a softplus would underflow). Not in the paper; Eq. 13 needs ``D(z) >= 0``.
     """
+    if eps == FLOOR_EPS and _by_kernel(x):
+        from geodiff_plugin.scale import kernels
+
+        return kernels.floored(x)
     root = torch.sqrt(x * x + 4.0 * eps * eps)
     # Below 0 the sum would cancel, and neighbouring values become equal in float32.
     return torch.where(x > 0, 0.5 * (x + root), 2.0 * eps * eps / (root - x.clamp_max(0.0)))
@@ -154,6 +165,9 @@ SPACES: dict[str, Space] = {
     "sqrt_disparity": Space(lambda v, g: g / v**2, torch.rsqrt, False, _sqrt_disparity_ends),
 }
 
+#: Spaces whose formula the kernels have, and its number there; in another one the reference runs.
+KERNEL_FORMS = {"depth": 0, "disparity": 1, "log": 2, "log1p": 3, "sqrt_disparity": 4}
+
 #: Field ``positive`` of the configuration that squares instead of taking the softplus.
 SQUARE = "square"
 
@@ -176,6 +190,11 @@ class MetricMap:
     def __post_init__(self) -> None:
         check_choice(self.space, "space", SPACES)
 
+    def _by_kernel(self, maps: Tensor, *numbers: Tensor) -> bool:
+        """Whether maps, each with its scale, shift and global scale, are made by the kernel."""
+        is_one_each = all(number.shape == maps.shape[:1] for number in numbers)
+        return self.space in KERNEL_FORMS and is_one_each and _by_kernel(maps, *numbers)
+
     def confine(self, x: Tensor) -> Tensor:
         """``x`` ready to be resampled: clipped with ``"square"``, unchanged with ``"softplus"``."""
         return x.clamp(0.0, 1.0) if self.positive == SQUARE else x
@@ -185,13 +204,23 @@ class MetricMap:
 
         Differentiable in ``x``, ``s_hat`` and ``t_hat``; linear in ``g_s``.
         """
-        s, t, g = (v.view(-1, 1, 1, 1) for v in (affine.scale, affine.shift, affine.g_s))
+        numbers = affine.scale, affine.shift, affine.g_s
+        if self._by_kernel(x, *numbers):
+            from geodiff_plugin.scale import kernels
+
+            return kernels.metric_depth(x, numbers, self)
+        s, t, g = (v.view(-1, 1, 1, 1) for v in numbers)
         confined = self.confine(x) if self.positive == SQUARE else smooth_floor(x)
         return SPACES[self.space].forward(s * confined + t, g)
 
     def relative(self, depth_m: Tensor, affine: AffineState) -> Tensor:
         """The relative map of a metric depth ``(B, 1, H, W)``; inverse of the call, bounded below 0."""
-        s, t, g = (v.view(-1, 1, 1, 1) for v in (affine.scale, affine.shift, affine.g_s))
+        numbers = affine.scale, affine.shift, affine.g_s
+        if self._by_kernel(depth_m, *numbers):
+            from geodiff_plugin.scale import kernels
+
+            return kernels.relative(depth_m, numbers, self)
+        s, t, g = (v.view(-1, 1, 1, 1) for v in numbers)
         floored = (SPACES[self.space].inverse(depth_m / g) - t) / s
         if self.positive == SQUARE:
             return self.confine(floored)
@@ -201,10 +230,12 @@ class MetricMap:
     def from_range(self, near_m: Tensor, far_m: Tensor) -> AffineState:
         """The affine state under which the two ends of a map have the depths, ``(B,)`` metres."""
         s, t, g = SPACES[self.space].from_ends(*SPACES[self.space].ends(near_m.float(), far_m.float()))
-        s, t = s.clamp_min(LEAST_SHARE), t.clamp_min(LEAST_SHARE)
+        both = torch.stack([s, t]).clamp_min(LEAST_SHARE)
         if self.positive == SQUARE:
+            s, t = both.unbind()
             return AffineState(torch.ones_like(s), torch.ones_like(t), g, (s, t))
-        return AffineState(inverse_softplus(s), inverse_softplus(t), g)
+        s_hat, t_hat = inverse_softplus(both).unbind()
+        return AffineState(s_hat, t_hat, g)
 
     def range_of(self, affine: AffineState) -> tuple[Tensor, Tensor]:
         """Nearest and farthest depth in metres, ``(B,)`` each; inverse of ``from_range``."""

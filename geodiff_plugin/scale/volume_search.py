@@ -19,8 +19,7 @@ from torch import Tensor
 from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin.geometry import to_device_of
 from geodiff_plugin.matching import CostVolume
-from geodiff_plugin.scale.points import KERNEL_FORMS
-from geodiff_plugin.scale.space import SPACES, DepthRange
+from geodiff_plugin.scale.space import KERNEL_FORMS, SPACES, DepthRange
 
 #: Cost beyond which a pixel is an outlier: occluded, a reflection, or wrong in the prior.
 COST_CLAMP = 0.35

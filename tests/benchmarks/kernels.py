@@ -31,7 +31,8 @@ from geodiff_plugin.result import kernels as result
 from geodiff_plugin.runtime import kernels as runtime
 from geodiff_plugin.scale import kernels as scale
 from geodiff_plugin.scale import search_kernels as search
-from geodiff_plugin.scale.points import BASIN_CANDIDATES, KERNEL_FORMS
+from geodiff_plugin.scale.points import BASIN_CANDIDATES
+from geodiff_plugin.scale.space import KERNEL_FORMS
 
 #: Compute capabilities of an A100 and of an H100.
 ARCHITECTURES = (80, 90)
@@ -110,6 +111,11 @@ def _of_the_result() -> Iterator[Compiled]:
     sizes = {"BLOCK": result.BLOCK, "IN_MEDIAN": result.IN_MEDIAN}
     median = "*fp32 *fp32 *fp32 *fp32 i32 i32"
     yield Compiled("median of votes", result.median_kernel, median, sizes, result.WARPS)
+    sizes = {"SPREAD": True, "PRIOR": 2, "PIXELS": result.PIXELS}
+    confidence = "*fp32 *fp32 *i1 *fp32 *fp32 *fp32 i32"
+    yield Compiled("confidence", result.confidence_kernel, confidence, sizes, 4)
+    sizes = {"CHANNELS": 3, "PIXELS": result.PIXELS}
+    yield Compiled("warp", result.warp_kernel, "*fp32 *fp32 *fp32 *fp32 *i1 i32 i32 i32 i32", sizes, 4)
 
 
 def _of_the_scale() -> Iterator[Compiled]:
@@ -118,6 +124,8 @@ def _of_the_scale() -> Iterator[Compiled]:
         sizes = {"FORM": KERNEL_FORMS["depth"], "BLOCK": block, "CHUNK": scale.CHUNK}
         yield Compiled(f"refinement, {block} matches", scale.refine_kernel, refine, sizes, scale.warps(block))
 
+    sizes = {"MAKES": scale.RELATIVE, "FORM": KERNEL_FORMS["log1p"], "CLIPPED": False, "PIXELS": scale.PIXELS}
+    yield Compiled("metric and relative maps", scale.map_kernel, 5 * "*fp32 " + "i32", sizes, 4)
     sizes = {"FORM": KERNEL_FORMS["depth"], "CLIPPED": False, "GRID": BASIN_CANDIDATES, "BLOCK": search.BLOCK}
     basin = "*fp32 *i64 " + 8 * "*fp32 " + 7 * "i32 "
     yield Compiled("search by points", search.basin_kernel, basin, sizes, 4)

@@ -42,11 +42,16 @@ WITH_KERNELS = (
     "sweep_planes",
     "match_volume",
     "solve_field",
+    "smooth_floor",
+    "MetricMap.__call__",
+    "MetricMap.relative",
     "_best_range",
     "fit_to_points",
     "refine_to_matches",
     "sharpen_edges",
     "_voted",
+    "_warped",
+    "depth_confidence",
 )
 #: Functions, and methods as ``Class.method``, whose operations are shown apart; each without those below it.
 STAGES = (

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin.matching import Matches
-from geodiff_plugin.scale.points import KERNEL_FORMS, refine_to_matches
-from geodiff_plugin.scale.space import SPACES
+from geodiff_plugin.scale.points import refine_to_matches
+from geodiff_plugin.scale.space import KERNEL_FORMS, SPACES
 from tests.kernels.drawn import drawn
 
 

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin.matching.rows import RowMatches
+from geodiff_plugin.result.confidence import _warped, depth_confidence
 from geodiff_plugin.result.voting import Voters, _voted
 from tests.kernels.drawn import drawn
 
@@ -46,3 +47,56 @@ def test_votes(device, seed, size, error, map_vote):
     # Where a half of the weight is reached is found by comparing sums, which rounding may decide otherwise.
     off = ((found - expected).abs() > 1e-5 * expected.abs().amax()).float().mean()
     assert off <= 5e-3 and found.isfinite().all()
+
+
+@drawn(4)
+@given(
+    seed=st.integers(0, 999),
+    batch=st.integers(1, 3),
+    size=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    spread=st.booleans(),
+    prior=st.sampled_from(["none", "number", "map"]),
+)
+@example(seed=0, batch=2, size=(31, 45), spread=True, prior="map")
+@example(seed=1, batch=2, size=(17, 9), spread=False, prior="number")
+@example(seed=2, batch=1, size=(17, 9), spread=False, prior="none")
+def test_confidence(device, seed, batch, size, spread, prior):
+    generator = torch.Generator().manual_seed(seed)
+
+    def rand(*shape: int) -> torch.Tensor:
+        return torch.rand(batch, 1, *shape, generator=generator).to(device)
+
+    given = rand(*size), 0.3 * rand(*size), rand(*size) > 0.3, 0.1 * rand(*size) if spread else None
+    error = {"none": None, "number": 0.6 * rand(1, 1), "map": 0.6 * rand(*size)}[prior]
+    found = depth_confidence(*given, error)
+    with without_kernels():
+        torch.testing.assert_close(found, depth_confidence(*given, error), rtol=1e-5, atol=1e-6)
+
+
+@drawn(4)
+@given(
+    seed=st.integers(0, 999),
+    size=st.tuples(st.integers(2, 40), st.integers(2, 40)),
+    size_right=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    turn=st.floats(-0.3, 0.3),
+)
+@example(seed=0, size=(31, 45), size_right=(29, 40), turn=0.1)
+@example(seed=1, size=(31, 45), size_right=(31, 45), turn=0.0)
+def test_a_right_image_seen_from_the_left(device, seed, size, size_right, turn):
+    """With skew, a turned camera, and points behind it."""
+    generator = torch.Generator().manual_seed(seed)
+    depth_m = 0.3 + 4.0 * torch.rand(1, 1, *size, generator=generator)
+    right = torch.rand(1, 3, *size_right, generator=generator)
+    K_left = torch.tensor([[[40.0, 0.3, 0.5 * size[1]], [0, 41.0, 0.5 * size[0]], [0, 0, 1]]])
+    K_right = torch.tensor([[[38.0, 0.1, 0.5 * size_right[1]], [0, 39.0, 0.5 * size_right[0]], [0, 0, 1]]])
+    cosine, sine = torch.tensor(turn).cos(), torch.tensor(turn).sin()
+    T = torch.eye(4)[None]
+    T[0, :3, 3] = torch.tensor([-0.2, 0.05, -0.5])
+    T[0, 0, 0], T[0, 0, 2], T[0, 2, 0], T[0, 2, 2] = cosine, sine, -sine, cosine
+    found, seen = _warped(right.to(device), depth_m.to(device), K_left, K_right, T)
+    with without_kernels():
+        expected, visible = _warped(right.to(device), depth_m.to(device), K_left, K_right, T)
+    # Rounding moves a place in the right image by 1e-5 px or so, more where a point is near the camera.
+    assert (seen != visible).float().mean() <= 2e-3
+    off = ((found - expected).abs().amax(1) > 1e-3).float().mean()
+    assert off <= 5e-3 and (found - expected).abs().mean() < 1e-5

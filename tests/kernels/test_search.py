@@ -19,6 +19,7 @@ from tests.kernels.test_refinement import random_matches
 @pytest.fixture(autouse=True)
 def small_grids(monkeypatch):
     """The interpreter runs one candidate after the other."""
+    monkeypatch.setattr(volume_search, "GROUPS", 37)
     monkeypatch.setattr(volume_search, "COARSE_GRID", 7)
     monkeypatch.setattr(volume_search, "FINE_GRIDS", (4, 3))
     monkeypatch.setattr(points, "BASIN_CANDIDATES", 9)
