@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from tests.conftest import plane_pair
+from tests.tiny import plane_pair
 
 STARTS_S = 600
 

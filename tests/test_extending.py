@@ -22,7 +22,7 @@ from geodiff_plugin.priors import PRIORS
 from geodiff_plugin.priors.components import DirectScheduler
 from geodiff_plugin.scale.points import fit_to_points
 from geodiff_plugin.scale.space import SPACES, MetricMap
-from tests.conftest import guided_call, make_vae, quiet, seeded
+from tests.tiny import guided_call, make_vae, quiet, seeded
 
 (PAGE,) = (Path(__file__).resolve().parents[1] / "docs").rglob("extending.md")
 #: Tables of the blocks that a reader takes alone, with all that they import.

@@ -12,11 +12,11 @@ from safetensors.torch import load_file, save_file
 
 from geodiff_plugin.priors import find_prior
 from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
-from tests.conftest import make_text_encoder, make_tokenizer, make_vae
 from tests.parity import marigold_v2_reference as reference
 from tests.parity.depthfm_reference import HPARAMS, VAE
 from tests.parity.depthmaster_reference import UNET
 from tests.parity.named_weights import fill, named_state
+from tests.tiny import make_text_encoder, make_tokenizer, make_vae
 
 FIXTURE = Path(__file__).parents[1] / "parity" / "fixtures" / "depthfm.npz"
 

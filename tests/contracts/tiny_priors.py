@@ -33,7 +33,9 @@ from geodiff_plugin.priors.geowizard import IMAGE_EMBEDDING, TEXT_PROMPT, GeoWiz
 from geodiff_plugin.priors.lotus import LotusPipeline
 from geodiff_plugin.priors.marigold import E2EFTPipeline
 from geodiff_plugin.priors.ppd import PixelDiT, PPDPipeline
-from tests.conftest import (
+from tests.contracts.tiny_transformers import make_transformers
+from tests.parity import depthfm_reference, depthmaster_reference, geowizard_reference, lotus_reference
+from tests.tiny import (
     SCHEDULER,
     make_marigold,
     make_text_encoder,
@@ -42,8 +44,6 @@ from tests.conftest import (
     make_vae,
     quiet,
 )
-from tests.contracts.tiny_transformers import make_transformers
-from tests.parity import depthfm_reference, depthmaster_reference, geowizard_reference, lotus_reference
 
 #: Under the groups of 32 that Stable Diffusion's has.
 TINY_VAE = {"block_out_channels": (8,) * 4, "norm_num_groups": 4}

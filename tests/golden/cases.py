@@ -18,11 +18,12 @@ import torch
 from diffusers import AutoencoderTiny
 from PIL import Image
 
+import tests.scenes.dataset  # noqa: F401  registers synthetic-plain
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior, read_calibration
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from tests.conftest import plane_pair
 from tests.contracts.tiny_priors import CALL, TINY
+from tests.tiny import plane_pair
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"

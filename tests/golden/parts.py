@@ -49,7 +49,7 @@ from geodiff_plugin.scale.points import (
 from geodiff_plugin.scale.space import SPACES, DepthRange, MetricMap
 from geodiff_plugin.scale.volume_search import search_scale
 from geodiff_plugin.types import CameraView, PosedViews
-from tests.conftest import textured
+from tests.tiny import textured
 
 SIZE, SIZES = (60, 88), ((72, 80), (54, 96))
 #: Normal and offset of two planes; the near one ends at 0.7 m to each side of the axis, 0.5 m up and down.

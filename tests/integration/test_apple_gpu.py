@@ -14,7 +14,7 @@ from torch.utils._pytree import tree_leaves
 import geodiff_plugin
 from geodiff_plugin import GeometryGuidance, load_prior
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
-from tests.conftest import guided_call, quiet
+from tests.tiny import guided_call, quiet
 
 PACKAGE = Path(geodiff_plugin.__file__).parent
 PAIR = read_demo_pair()

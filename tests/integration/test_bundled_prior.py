@@ -19,7 +19,7 @@ from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.jobs.prior import load_guided_prior
 from geodiff_plugin.jobs.telling import silent
 from geodiff_plugin.priors import BUNDLED_FOLDER, load_prior
-from tests.conftest import guided_call, quiet
+from tests.tiny import guided_call, quiet
 
 
 def test_the_folder_is_small_and_holds_no_pickle():

@@ -9,7 +9,7 @@ from pathlib import Path
 import geodiff_plugin
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from tests.benchmarks.cost import resized_pair
-from tests.conftest import seeded
+from tests.tiny import seeded
 
 ROOT = Path(geodiff_plugin.__file__).parent
 PAGE = ROOT.parent / "docs/explanation/dataflow.md"

@@ -10,7 +10,7 @@ from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings, find_method
 from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.formats.depth import read_map, write_pfm
-from tests.conftest import guided_call, quiet
+from tests.tiny import guided_call, quiet
 
 PAIR = read_demo_pair()
 TRUTH = PAIR.depth_m.astype(np.float64)

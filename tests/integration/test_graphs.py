@@ -8,7 +8,7 @@ from geodiff_plugin._checks import InputError
 from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.runtime.graphs import GraphedForward
-from tests.conftest import guided_call, make_marigold, seeded
+from tests.tiny import guided_call, make_marigold, seeded
 
 
 def forwards(pipe) -> dict[str, object]:

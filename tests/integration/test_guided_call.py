@@ -28,8 +28,8 @@ from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.terms import TERMS, Term
 from geodiff_plugin.config import GuidanceConfig, UpdatePlan
 from geodiff_plugin.runtime.run import GuidedRun
-from tests.conftest import SCHEDULER, guided_call, quiet, seeded
 from tests.contracts.tiny_priors import make_e2e_ft
+from tests.tiny import SCHEDULER, guided_call, quiet, seeded
 
 FAST = {"inner_steps": 2, "min_steps": 1, "sweep_pixels": 64 * 48}
 PHOTOMETRIC = {"photometric": 1.0}  # alone: matches would also correct the map

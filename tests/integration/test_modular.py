@@ -14,7 +14,7 @@ from PIL import Image
 
 from examples.modular import block
 from geodiff_plugin import load_prior
-from tests.conftest import guided_call, quiet, seeded
+from tests.tiny import guided_call, quiet, seeded
 
 FOLDER = Path(block.__file__).parent
 KNOBS = {"min_steps": 3, "pose": "given"}

@@ -9,11 +9,13 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -30,6 +32,7 @@ from geodiff_plugin.formats.depth import depth_mm  # noqa: E402
 from geodiff_plugin.jobs.options import DepthOptions  # noqa: E402
 from geodiff_plugin.jobs.ray import Workers, depth_dataset  # noqa: E402
 from geodiff_plugin.jobs.rows import COLUMNS  # noqa: E402
+from tests.benchmarks.engines import folders_done, rows_done  # noqa: E402
 from tests.benchmarks.many import write_pairs  # noqa: E402
 from tests.evaluating import write_scenes  # noqa: E402
 from tests.unit.capture_room import render, walk, write_transforms  # noqa: E402
@@ -37,10 +40,12 @@ from tests.unit.capture_room import render, walk, write_transforms  # noqa: E402
 PAIRS, FEW, SIZE = 24, 8, (64, 96)
 FRAMES = walk(10)[3:7]
 QUICK = "--steps 1 --preset paper --device cpu -q".split()
-RAY = ["--engine", "ray", "--workers", "2"]
-LAYOUTS = ("folders", "parquet")
-#: Of every process that computes. Ray's own are nice by 15, and would starve where the machine is busy.
-ENVIRONMENT = {"OMP_NUM_THREADS": "1", "RAY_worker_niceness": "0"}
+RAY, RAY_OF_ONE = (["--engine", "ray", "--workers", count] for count in "21")
+DONE = {"folders": folders_done, "parquet": rows_done}
+LAYOUTS = tuple(DONE)
+#: Of every process that computes. Ray's own are nice by 15, and would starve where the machine is busy; and
+#: they would end when idle, where here the next command uses them again, without importing torch anew.
+ENVIRONMENT = {"OMP_NUM_THREADS": "1", "RAY_worker_niceness": "0", "RAY_kill_idle_workers_interval_ms": "0"}
 #: Begins what a process of Ray that holds the prior calls itself.
 ACTOR = "ray::MapWorker"
 
@@ -68,29 +73,24 @@ class Pairs(NamedTuple):
         return ["depth", str(self.folder / "left"), str(self.folder / "right"), *camera, *QUICK]
 
 
-def start(words: list[str]) -> subprocess.Popen:
-    """A command in a process of its own, which starts a Ray of its own if it needs one."""
+def start(words: list[str], address: str | None) -> subprocess.Popen:
+    """A command in a process of its own, which uses the Ray of this address, or starts one of its own."""
     environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
     environment |= ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    environment |= {} if address is None else {"RAY_ADDRESS": address}
     command = [sys.executable, "-m", "geodiff_plugin", *words]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, env=environment, process_group=0, **pipes)
 
 
-def alone(words: list[str]) -> Answer:
-    process = start(words)
-    out, err = process.communicate(timeout=1800)
-    return Answer(process.returncode, out, err)
-
-
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[None]:
-    """A Ray with two CPUs, whose processes the commands of this process share."""
+def cluster() -> Iterator[str]:
+    """The address of a Ray with two CPUs, which the commands of this process share."""
     ours = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(sys.path)}
     before = {name: os.environ.get(name) for name in ours}
     os.environ |= ours
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
-    yield
+    yield ray.get_runtime_context().gcs_address
     ray.shutdown()
     for name, value in before.items():
         os.environ.pop(name)
@@ -113,7 +113,7 @@ def rendered(folder: Path, count: int) -> Pairs:
     folder.mkdir(exist_ok=True)
     options = write_pairs(folder, count, SIZE)
     pairs = Pairs(folder, {name: getattr(options, name) for name in ("fx", "fy", "cx", "cy", "baseline")})
-    answer = alone([*pairs.words(), "--out", str(pairs.one)])
+    answer = call([*pairs.words(), "--out", str(pairs.one)])
     assert answer.code == 0, answer.err
     return pairs
 
@@ -250,9 +250,9 @@ def broken(few: Pairs, folder: Path) -> list[str]:
 
 def test_broken_rows_are_rows_with_an_error_and_the_rest_is_done(few, cluster, tmp_path):
     words = broken(few, tmp_path)
-    one = alone([*words, "--out", str(tmp_path / "one")])
+    one = call([*words, "--out", str(tmp_path / "one")])
     for layout in LAYOUTS:
-        answer = call([*words, *RAY, "--as", layout, "--out", str(tmp_path / layout)])
+        answer = call([*words, *RAY_OF_ONE, "--as", layout, "--out", str(tmp_path / layout)])
         assert answer.code == one.code == 4, answer.err
         assert "000001: LEFT must be a whole image file" in answer.err
     assert contents(tmp_path / "folders") == contents(tmp_path / "one")
@@ -265,7 +265,7 @@ def test_broken_rows_are_rows_with_an_error_and_the_rest_is_done(few, cluster, t
     shutil.copy(few.folder / "left" / "000001.png", tmp_path / "left")  # mended, both are done
     listed = (tmp_path / "list.csv").read_text()
     (tmp_path / "list.csv").write_text(listed.replace("right/000003.png\n", "right/000003.png,calib.txt\n"))
-    answer = call([*words, *RAY, "--out", str(tmp_path / "parquet"), "--json"])
+    answer = call([*words, *RAY_OF_ONE, "--out", str(tmp_path / "parquet"), "--json"])
     assert json.loads(answer.out)["done"] == 2, answer.err
     rows = rows_of(tmp_path / "parquet")
     assert len(rows) == FEW and not any(row["error"] for row in rows.values())
@@ -273,58 +273,69 @@ def test_broken_rows_are_rows_with_an_error_and_the_rest_is_done(few, cluster, t
 
 def test_what_holds_for_all_pairs_is_said_once_and_leaves_no_folder(few, cluster, tmp_path):
     words = few._replace(cameras=few.cameras | {"cx": 5000.0}).words()
-    answer = call([*words, *RAY, "--as", "folders", "--out", str(tmp_path / "out")])
+    answer = call([*words, *RAY_OF_ONE, "--as", "folders", "--out", str(tmp_path / "out")])
     assert answer.code == 2 and "The same holds for all 8 pairs" in answer.err, answer.err
     assert not (tmp_path / "out").exists()
 
 
-def actors() -> list[psutil.Process]:
-    """The processes of any Ray on this machine that hold the prior."""
-    every = [(each, each.info["cmdline"]) for each in psutil.process_iter(["cmdline"])]
-    return [each for each, words in every if words and words[0].startswith(ACTOR)]
+def actors(driver: int) -> list[psutil.Process]:
+    """The processes below a driver that hold the prior."""
+    below = [(each, _words_of(each)) for each in psutil.Process(driver).children(recursive=True)]
+    return [each for each, words in below if words and words[0].startswith(ACTOR)]
 
 
-def below(process: psutil.Process) -> set[int]:
-    return {each.pid for each in process.children(recursive=True)}
+def _words_of(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.Error:  # it has just ended
+        return []
 
 
-def when(happened, process: subprocess.Popen, seconds: float = 900.0):
-    """What ``happened`` returns, as soon as it is something."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end and process.poll() is None:
-        if result := happened():
-            return result
+def when(happened: Callable[[], Any], running: Callable[[], bool], seconds: float = 900.0) -> Any:
+    """What ``happened`` returns, as soon as it is something; nothing where what is running ends before."""
+    end, result = time.monotonic() + seconds, happened()
+    while not result and time.monotonic() < end and running():
         time.sleep(0.05)
-    process.kill()
-    raise AssertionError(f"it never happened: {process.communicate()}")
+        result = happened()
+    return result
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_worker_that_is_killed_in_the_middle_costs_nothing(few, tmp_path, layout):
-    out = tmp_path / "out"
-    process = start([*few.words(), *RAY, "--as", layout, "--out", str(out)])
-    when(lambda: results(out, layout), process)
-    ours = below(psutil.Process(process.pid))
-    victims = [each for each in actors() if each.pid in ours]
-    assert victims and len(results(out, "folders")) < FEW
-    victims[0].send_signal(signal.SIGKILL)
-    _, err = process.communicate(timeout=1800)
-    assert process.returncode == 0, err
+def test_a_worker_that_is_killed_in_the_middle_costs_nothing(few, cluster, tmp_path, layout):
+    out, over = tmp_path / "out", threading.Event()
+
+    def kill() -> int:
+        """Kill a process that holds the prior when the first results are there; how many those are."""
+        done = when(lambda: DONE[layout](out), lambda: not over.is_set())
+        actors(os.getpid())[0].send_signal(signal.SIGKILL)
+        return done
+
+    with ThreadPoolExecutor(1) as beside:
+        killed = beside.submit(kill)
+        try:
+            answer = call([*few.words(), *RAY, "--as", layout, "--out", str(out)])
+        finally:
+            over.set()
+    assert answer.code == 0, answer.err
+    assert 0 < killed.result() < FEW
     check_whole(out, layout, few)
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_driver_that_is_killed_and_started_again_does_what_is_missing(few, cluster, tmp_path, layout):
+@pytest.mark.parametrize(("layout", "shared"), [("folders", False), ("parquet", True)])
+def test_a_driver_that_is_killed_and_started_again_does_what_is_missing(
+    few, cluster, tmp_path, layout, shared
+):
     out = tmp_path / "out"
     words = [*few.words(), *RAY, "--as", layout, "--out", str(out)]
-    process = start(words)
-    when(lambda: results(out, layout), process)
-    children = psutil.Process(process.pid).children(recursive=True)
+    process = start(words, cluster if shared else None)
+    begun = when(lambda: DONE[layout](out), lambda: process.poll() is None)
+    left = [*actors(os.getpid()), *psutil.Process(process.pid).children(recursive=True)] if begun else []
     process.send_signal(signal.SIGKILL)
-    process.communicate()
-    psutil.wait_procs(children, timeout=120)
+    _, err = process.communicate()
+    assert begun, err
+    _, alive = psutil.wait_procs(left, timeout=120)  # they end with their driver
+    assert not alive
     before = results(out, layout)
-    assert before
     answer = call(words)
     assert answer.code == 0, answer.err
     after = results(out, layout)
@@ -351,7 +362,7 @@ def test_a_full_disk_ends_the_run_with_a_sentence_and_what_is_done_stays(
     few, cluster, tmp_path, layout, kilobytes
 ):
     with small_disk(tmp_path / "disk", kilobytes) as disk:
-        words = [*few.words(), *RAY, "--as", layout, "--out", str(disk / "out")]
+        words = [*few.words(), *RAY_OF_ONE, "--as", layout, "--out", str(disk / "out")]
         answer = call(words)
         assert answer.code == 2 and "The disk of --out is full" in answer.err, answer.err
         before = results(disk / "out", layout)
@@ -399,18 +410,7 @@ def test_the_job_is_not_divided_twice(few, cluster, monkeypatch, tmp_path):
 
 def test_cells_of_an_evaluation_are_those_of_one_process(cluster, tmp_path):
     scenes = str(write_scenes(tmp_path / "scenes", "hall", "yard"))
-    words = [
-        "eval",
-        "pairs",
-        scenes,
-        "--methods",
-        "sgbm,search-only",
-        "--steps",
-        "1",
-        "--device",
-        "cpu",
-        "-q",
-    ]
+    words = ["eval", "pairs", scenes, *"--methods sgbm,search-only --steps 1 --device cpu -q".split()]
     records = []
     for engine in ([], RAY):
         out = tmp_path / f"{len(records)}"
@@ -429,7 +429,7 @@ def test_frames_of_a_capture_are_those_of_one_process(cluster, tmp_path):
         np.save(tmp_path / f"maps/f{number:02d}.npy", render(E)[1].astype(np.float32))
     words = ["capture", str(tmp_path / "scan"), "--prior-map", str(tmp_path / "maps"), "--frames", "f01,f02"]
     words += ["--poses", "given", *"--steps 1 --neighbours 1 --device cpu -q".split()]
-    for name, engine in {"one": ["--processes", "1"], "ray": RAY}.items():
+    for name, engine in {"one": ["--processes", "1"], "ray": RAY_OF_ONE}.items():
         answer = call([*words, *engine, "--out", str(tmp_path / name)])
         assert answer.code in (0, 4), answer.err
     made = {path: path.stat().st_mtime_ns for path in (tmp_path / "ray").glob("*/depth_alone.npy")}
@@ -437,7 +437,7 @@ def test_frames_of_a_capture_are_those_of_one_process(cluster, tmp_path):
     for path in made:
         assert path.read_bytes() == (tmp_path / "one" / path.relative_to(tmp_path / "ray")).read_bytes()
     (tmp_path / "ray" / "f02" / "depth_alone.npy").unlink()
-    answer = call([*words, *RAY, "--out", str(tmp_path / "ray")])
+    answer = call([*words, *RAY_OF_ONE, "--out", str(tmp_path / "ray")])
     assert answer.code in (0, 4), answer.err
     again = [path.parent.name for path, time_ns in made.items() if path.stat().st_mtime_ns != time_ns]
     assert again == ["f02"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from examples.robustmvd.model import GeoDiffModel, benchmark_metrics
-from tests.conftest import guided_call
+from tests.tiny import guided_call
 
 FAST = {"inner_steps": 0, "min_steps": 1, "pose": "given"}
 

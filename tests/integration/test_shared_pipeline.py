@@ -12,8 +12,8 @@ from diffusers import DDIMScheduler, DPMSolverMultistepScheduler, MarigoldDepthP
 from diffusers.configuration_utils import FrozenDict
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from tests.conftest import SCHEDULER, quiet, seeded
 from tests.contracts.tiny_priors import AT_64, make_lotus
+from tests.tiny import SCHEDULER, quiet, seeded
 
 BETAS = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012}
 SCHEDULERS = {

@@ -9,7 +9,7 @@ from diffusers import AutoencoderTiny
 
 from geodiff_plugin.runtime import codec
 from geodiff_plugin.runtime.codec import KNOWN, _loaded
-from tests.conftest import guided_call, make_vae
+from tests.tiny import guided_call, make_vae
 
 
 def tiny_folder(path, channels=4, stages=2):

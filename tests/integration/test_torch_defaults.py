@@ -11,9 +11,9 @@ from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.pose.refine import refine_views
 from geodiff_plugin.runtime.hooks import images_in_float32
 from geodiff_plugin.types import CameraView
-from tests.conftest import guided_call, plane_pair
 from tests.contracts.tiny_priors import TINY, make_e2e_ft
 from tests.scenes import render_pair
+from tests.tiny import guided_call, plane_pair
 
 DEFAULTS = ("meta", torch.float64, torch.bfloat16)
 WEIGHTS = {"photometric": 1.0, "prior_pull": 0.01, "anchor": 0.1}

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance, load_bundled_prior
-from tests.conftest import seeded
 from tests.scenes import Camera, render_views, sample_scene
 from tests.scenes.cameras import intrinsics
+from tests.tiny import seeded
 
 SIZE = (72, 96)
 FAST = {"inner_steps": 4, "min_steps": 1, "sweep_pixels": 96 * 72}

@@ -13,7 +13,7 @@ from torch.utils._pytree import tree_leaves
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.result import output
 from geodiff_plugin.scale.points import RELIABLE, reliable_matches
-from tests.conftest import guided_call
+from tests.tiny import guided_call
 
 #: Operations whose result has a size, or is a number, that only the device knows.
 READ_BACK = (

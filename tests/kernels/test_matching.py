@@ -12,8 +12,8 @@ from geodiff_plugin.matching.aggregation import jump_penalties
 from geodiff_plugin.matching.census import COST_LEVELS, grey
 from geodiff_plugin.matching.winner import NEVER, winner, winner_positions
 from geodiff_plugin.types import CameraView
-from tests.conftest import render_plane
 from tests.kernels.drawn import drawn
+from tests.tiny import render_plane
 
 SIZES = st.tuples(*(st.integers(1, most) for most in (37, 9, 11)))
 FOUR, EIGHT = [(1, 0), (0, 1)], [(1, 0), (0, 1), (1, 1), (1, -1)]

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from diffusers import DDIMScheduler, MarigoldDepthPipeline
 
-from tests.conftest import make_text_encoder, make_tokenizer, make_unet, make_vae, quiet
 from tests.parity import authors
 from tests.parity.named_weights import draw, fill
+from tests.tiny import make_text_encoder, make_tokenizer, make_unet, make_vae, quiet
 
 #: Marigold v1-0's, with the spacing that their script sets.
 SCHEDULER = authors.SCHEDULER | {"timestep_spacing": "trailing"}

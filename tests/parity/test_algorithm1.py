@@ -6,8 +6,8 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from tests.conftest import plane_pair
 from tests.parity.algorithm1_oracle import algorithm_1
+from tests.tiny import plane_pair
 
 STEPS = 4
 #: Above the paper's 1e-2, so that a few steps move latents, scale and shift well beyond rounding.

@@ -19,7 +19,6 @@ from geodiff_plugin.priors.depthmaster import DepthMasterPipeline, FourierUNet
 from geodiff_plugin.priors.geowizard import GeoWizardPipeline
 from geodiff_plugin.priors.lotus import LotusPipeline
 from geodiff_plugin.priors.marigold import E2EFTPipeline, E2EFTPrior
-from tests.conftest import make_text_encoder
 from tests.contracts.tiny_priors import make_tokenizer, quiet
 from tests.parity import (
     depthfm_reference,
@@ -29,6 +28,7 @@ from tests.parity import (
     lotus_reference,
 )
 from tests.parity.named_weights import fill, weight
+from tests.tiny import make_text_encoder
 
 ATOL = 1e-4
 

@@ -18,7 +18,7 @@ from geodiff_plugin.geometry import warp_right_to_left
 from geodiff_plugin.scale.space import MetricMap
 from geodiff_plugin.types import CameraView, PosedViews
 from tests.benchmarks.matching import textured_pair
-from tests.conftest import render_plane
+from tests.tiny import render_plane
 
 NORMAL, OFFSET = np.array([0.1, -0.2, 1.0]), 2.0
 

@@ -10,7 +10,7 @@ from geodiff_plugin._kernels import ALWAYS_LAUNCHED, compilation_ahead, without_
 from geodiff_plugin.jobs import prior as jobs_prior
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.runtime import guided_call
-from tests.conftest import guided_call as call_guided
+from tests.tiny import guided_call as call_guided
 
 CUDA = torch.device("cuda")
 

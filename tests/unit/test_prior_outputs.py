@@ -11,8 +11,8 @@ from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin.priors import PRIORS
 from tests.benchmarks.full_sizes import FULL_SIZES
 from tests.benchmarks.memory import count_memory
-from tests.conftest import plane_pair
 from tests.contracts.tiny_priors import CALL, TINY
+from tests.tiny import plane_pair
 
 FILE = Path(__file__).with_name("prior_outputs.npz")
 #: Every eighth column and sixth row.

@@ -15,8 +15,8 @@ from geodiff_plugin.priors.geowizard import GeoWizardPipeline, closest_to_mean
 from geodiff_plugin.priors.loading import Layout
 from geodiff_plugin.priors.lotus import LotusPipeline, space_of_name
 from geodiff_plugin.priors.ppd import AreaImageProcessor
-from tests.conftest import make_unet
 from tests.contracts.tiny_priors import make_depthfm, make_depthmaster, make_geowizard, make_lotus, quiet
+from tests.tiny import make_unet
 
 IMAGE = np.random.default_rng(0).random((44, 60, 3)).astype(np.float32)
 

@@ -14,7 +14,7 @@ from geodiff_plugin.matching import build_cost_volume, match_volume, points_to_m
 from geodiff_plugin.matching.build import inverse_pose_preferred, pilot_volume, to_grid
 from geodiff_plugin.matching.sweep import sweep_planes
 from geodiff_plugin.types import CameraView, PosedViews
-from tests.conftest import textured
+from tests.tiny import textured
 from tests.unit.test_geometry import points_of, tensor
 
 SIZE = (48, 64)
