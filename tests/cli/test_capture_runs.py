@@ -24,6 +24,8 @@ from geodiff_plugin.result.misfit import MATCH_NOISE_PX, expected_error
 from tests.cli.conftest import call
 from tests.unit.capture_room import render, walk, write_transforms
 
+pytestmark = pytest.mark.usefixtures("plain_pictures")
+
 TRUE = walk(10)[3:7]
 QUICK = ["--steps", 1, "--neighbours", 1, "--processes", 1, "--device", "cpu", "-q"]
 
@@ -162,10 +164,16 @@ def test_a_failed_frame_before_an_untrusted_one_is_a_sentence(scan, geodiff):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM to be caught")
-def test_asked_to_end_it_clears_away_what_it_began(tmp_path):
-    write_transforms(tmp_path / "scan", TRUE, TRUE)
-    out = tmp_path / "out"
-    words = ["capture", tmp_path / "scan", "--out", out, "--processes", "2", "--device", "cpu", "-q"]
+def test_asked_to_end_it_clears_away_what_it_began(finished, tmp_path):
+    out, given = tmp_path / "out", ["--prior-map", finished / "maps", "--poses", "given"]
+    words = [
+        "capture",
+        finished / "scan",
+        "--out",
+        out,
+        *given,
+        *"--steps 1 --processes 2 --device cpu -q".split(),
+    ]
     shell = [sys.executable, "-m", "geodiff_plugin", *map(str, words)]
     with subprocess.Popen(shell, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
         deadline = time.monotonic() + 300

@@ -137,6 +137,7 @@ def test_demo(geodiff, prior, pair_files, monkeypatch):
     assert np.load("geodiff-demo/depth.npy").shape == (336, 448)
 
 
+@pytest.mark.slow
 def test_demo_on_real_pairs(geodiff, prior, pair_files, monkeypatch):
     monkeypatch.setattr("geodiff_plugin.priors.loading.BUNDLED_FOLDER", prior)
     answer = geodiff("demo", "--real", "--quiet")

@@ -3,11 +3,16 @@
 import json
 import re
 import shlex
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
+
+from geodiff_plugin.jobs.prior import load_quiet_prior
 
 INPUTS = Path(__file__).resolve().parents[3] / "shared" / "data" / "inputs"
 TRUTH = INPUTS / "_truth"
@@ -15,7 +20,10 @@ TRUTH = INPUTS / "_truth"
 UNSURE = ("10o_one_null_pose",)
 #: Centimetres that nothing names.
 DOUBTED_UNIT = "p13_opencv_cm"
-pytestmark = pytest.mark.skipif(not TRUTH.is_dir(), reason="the inputs are not there")
+pytestmark = [
+    pytest.mark.skipif(not TRUTH.is_dir(), reason="the inputs are not there"),
+    pytest.mark.usefixtures("plain_pictures", "one_prior"),
+]
 CASES = sorted(path.name for path in INPUTS.glob("*") if path.name[0] != "_") if TRUTH.is_dir() else []
 #: Commands of the inputs that work as they are, beside which the others were made.
 TWINS = {
@@ -58,6 +66,20 @@ def depth_of_bag(path: Path) -> np.ndarray:
     return message.data.view("<u2").reshape(message.height, message.width) / 1000
 
 
+@cache
+def loaded(name: str, device: torch.device) -> Any:
+    return load_quiet_prior(name, device)
+
+
+@pytest.fixture
+def one_prior(monkeypatch):
+    """The prior is loaded once for all cases."""
+    for module in ("capture", "prior"):
+        monkeypatch.setattr(
+            f"geodiff_plugin.jobs.{module}.load_quiet_prior", lambda name, device, *_: loaded(name, device)
+        )
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_an_input_of_the_world_is_right_or_kindly_refused(case, geodiff, tmp_path, monkeypatch):
     if case.startswith("b_"):
@@ -68,6 +90,7 @@ def test_an_input_of_the_world_is_right_or_kindly_refused(case, geodiff, tmp_pat
     if words[0] == "capture":
         pytest.importorskip("pycolmap")
         words += ["--frames", f"{FRAME}:{FRAME}", "--processes", "1"]
+    words += [] if case in TWINS else ["--steps", "1"]
     answer = geodiff(*words, "--out", out, "-q")
     if case == "d_negative_npy":
         assert answer.code == 2 and "Right minus left" in answer.err and "-disparity" in answer.err

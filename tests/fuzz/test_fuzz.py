@@ -33,7 +33,7 @@ COMMON: dict[str, Any] = {
     "derandomize": True,
     "suppress_health_check": list(HealthCheck),
 }
-EXAMPLES = settings(max_examples=25, **COMMON)
+EXAMPLES = settings(max_examples=15, **COMMON)
 MANY = settings(max_examples=int(os.environ.get("GEODIFF_FUZZ", "1500")), **COMMON)
 
 WORDS = b'nan inf -inf 1e999 -1 0 1e-300 [ ] { } : , ; = < > 1e5 # " rows:'

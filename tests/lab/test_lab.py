@@ -24,6 +24,7 @@ def test_pages_name_the_command_that_made_them(tmp_path):
     assert json.loads((tmp_path / "table.json").read_text())["command"] == f"{PROGRAM} {' '.join(words)}"
 
 
+@pytest.mark.slow
 def test_a_process_of_its_own_knows_the_rendered_pairs():
     (ref,) = find_pairs("synthetic:1@64x48")
     with fresh_process() as process:

@@ -21,6 +21,7 @@ def test_flicker_is_what_changes_on_the_same_points():
     assert points == pytest.approx(0.2 / np.sqrt(np.pi), rel=0.1) and breath < 0.02
 
 
+@pytest.mark.slow
 def test_the_command_measures_and_goes_on(tmp_path, monkeypatch):
     given = {"size": (64, 96), "ways": ("alone", "steady"), "steps": 2, "out": tmp_path, "quiet": True}
     options = SequenceOptions(scenes=1, frames=2, **given)

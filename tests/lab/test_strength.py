@@ -29,6 +29,7 @@ def test_a_prior_errs_as_much_as_it_says(sample, space):
     assert ranks == pytest.approx(-1.0 if space == "disparity" else 1.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_page_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
     methods = ("prior-aligned", "prior-fit", "guided")
     given = {"strengths": ("exact", "20%"), "methods": methods, "steps": 2, "resolution": 96, "quiet": True}

@@ -39,6 +39,7 @@ def test_noise_shows_in_percent_of_the_planes_mean_and_outliers_in_the_rms_alone
     assert spoiled.mad < 4.0
 
 
+@pytest.mark.slow
 def test_a_call_that_is_observed_gives_the_same_result_and_all_stages(tmp_path):
     sample = load(find_pairs(Path(SMALL))[0])
     pipe = enable_geometry_guidance(load_prior("bundled"))
@@ -62,6 +63,7 @@ def test_the_table_names_every_pair_with_truth(capsys):
     assert "mean" in shown
 
 
+@pytest.mark.slow
 def test_a_part_that_is_left_out_changes_the_table_and_others_are_refused(capsys):
     shown = []
     for without in ("", "votes", "flattening"):
