@@ -53,15 +53,6 @@ def command(pair_files, prior) -> list[str]:
     return [*pair_files.command, "--prior", prior, "--device", "cpu"]
 
 
-@pytest.fixture
-def plain_pictures(monkeypatch):
-    """Pictures of maps without their colour bars, which take longer to draw than a small pair to guide.
-
-    ``test_depth`` and ``test_plotting`` look at them.
-    """
-    monkeypatch.setattr("geodiff_plugin.plotting._figure", lambda picture, *_: Image.fromarray(picture))
-
-
 def call(words) -> int:
     """Run the command in this process; its exit code."""
     with pytest.raises(SystemExit) as leaving:

@@ -213,7 +213,7 @@ def test_folders_are_those_of_one_process_byte_for_byte(many, cluster, tmp_path)
 
 def test_parquet_holds_the_same_depth_and_a_second_run_does_what_is_missing(few, cluster, tmp_path):
     out = tmp_path / "out"
-    words = [*few.words(), *RAY, "--out", str(out), "--json"]
+    words = [*few.words(), *RAY_OF_ONE, "--out", str(out), "--json"]
     answer = call(words)
     assert answer.code == 0, answer.err
     assert json.loads(answer.out)["done"] == FEW
@@ -326,7 +326,7 @@ def test_a_driver_that_is_killed_and_started_again_does_what_is_missing(
     few, cluster, tmp_path, layout, shared
 ):
     out = tmp_path / "out"
-    words = [*few.words(), *RAY, "--as", layout, "--out", str(out)]
+    words = [*few.words(), *RAY_OF_ONE, "--as", layout, "--out", str(out)]
     process = start(words, cluster if shared else None)
     begun = when(lambda: DONE[layout](out), lambda: process.poll() is None)
     left = [*actors(os.getpid()), *psutil.Process(process.pid).children(recursive=True)] if begun else []
