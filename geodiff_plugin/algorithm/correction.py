@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._kernels import launch_bound
-from geodiff_plugin.algorithm.solver import RobustSystem, solve_robust
+from geodiff_plugin.algorithm.solver import RobustField, RobustSystem, solve_robust
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import Matches, with_points
@@ -121,15 +121,6 @@ def edge_links(guide: Tensor, log_depth: Tensor, axis: int) -> Tensor:
     return scale**2 * torch.exp(-scale * (step + jump)).clamp_min(LEAST_LINK)
 
 
-def _scaled(links: tuple[Tensor, Tensor], smoothness: Tensor) -> tuple[Tensor, Tensor]:
-    """Links times a smoothness ``(B, 1, 1, 1)``, or ``(B, 1, h, w)``: the lower one of both ends."""
-    if smoothness.shape[-2:] != (1, 1):
-        across = torch.minimum(smoothness[..., 1:], smoothness[..., :-1])
-        down = torch.minimum(smoothness[..., 1:, :], smoothness[..., :-1, :])
-        return across * links[0], down * links[1]
-    return smoothness * links[0], smoothness * links[1]
-
-
 def local_error(error: Tensor | None, valid: Tensor | None) -> Tensor | None:
     """A prior's ``error (B, 1, 1, 1)`` where it gives a depth, ``MOST_ERROR`` elsewhere, ``(B, 1, H, W)``.
 
@@ -206,26 +197,17 @@ def highest(values: Tensor, reach: int) -> Tensor:
     return values
 
 
-def _variance(noise: Tensor, error: Tensor, config: GuidanceConfig) -> Tensor:
-    """Variance of a match plus that of the prior, from which ``_robust`` counts a residual as large."""
-    return config.outlier_width**2 * (noise**2 + error**2)
+def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: GuidanceConfig) -> RobustField:
+    """The correction that follows matches over wide regions only, and their weights at what it leaves.
 
-
-def _robust(residual: Tensor, variance: Tensor) -> Tensor:
-    """Cauchy weight of residuals."""
-    return (1.0 + residual**2 / variance).reciprocal()
-
-
-def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: GuidanceConfig) -> Tensor:
-    """The correction ``(B, 1, h, w)`` that follows matches over wide regions only."""
-    stiff, variance = torch.full_like(error, STIFF_SMOOTHNESS), _variance(observed.noise, error, config)
-
-    def robust(left_over: Tensor) -> Tensor:
-        return trusted * _robust(left_over, variance)
-
-    links, inertia = _scaled(observed.links, stiff), STIFF_INERTIA * stiff
-    system = RobustSystem(observed.residual, links, inertia, robust)
-    return solve_robust(system, trusted, REWEIGHTINGS + 1, SOLVER_STEPS)[0]
+    ``trusted`` may be several sets of weights, as for ``solve_robust``. A residual counts half at
+    ``outlier_width`` standard deviations of match and prior together.
+    """
+    width = config.outlier_width * (observed.noise**2 + error**2).sqrt()
+    stiff = error.new_full((1, len(error), 1, 1, 1), STIFF_SMOOTHNESS)
+    inertia = error.new_full((1, len(error), 1, 1, 1), STIFF_INERTIA * STIFF_SMOOTHNESS)
+    system = RobustSystem(observed.residual, trusted, width, observed.links, stiff, inertia)
+    return solve_robust(system, REWEIGHTINGS + 1, SOLVER_STEPS)
 
 
 def _spread(residual: Tensor, observed: _Observations) -> Tensor:
@@ -256,9 +238,11 @@ def prior_error(
     side = max(1, round(BLOCK * max(height, width)))
     rows, columns = (torch.arange(n, device=depth_m.device) // side for n in (height, width))
     black = ((rows[:, None] + columns[None]) % 2).to(observed.residual.dtype)
+    of_black = observed.weight * black
     first = _spread(observed.residual, observed)
-    predicted = [_stiff(observed, observed.weight * colour, first, config) for colour in (black, 1.0 - black)]
-    error = _spread(torch.where(black > 0, predicted[1], predicted[0]) - observed.residual, observed)
+    kept = torch.cat([of_black, observed.weight - of_black])
+    of_black, of_white = _stiff(observed, kept, first, config).field.chunk(2)
+    error = _spread(torch.where(black > 0, of_white, of_black) - observed.residual, observed)
     share = ((observed.weight > 0).float().sum((1, 2, 3), keepdim=True) / FEW_POINTS).clamp_max(1.0)
     return error**share * MOST_ERROR ** (1.0 - share)
 
@@ -289,23 +273,11 @@ def fit_depth(
     """
     observed = _observations(depth_m, target, left_01, config)
     error = _on_grid(error, target.size)
-    broad = _stiff(observed, observed.weight, error, config)
-    trusted = observed.weight * _robust(broad - observed.residual, _variance(observed.noise, error, config))
+    trusted = _stiff(observed, observed.weight, error, config).weights
     width = RESIDUAL_CAUCHY * observed.noise
-
-    def robust(left_over: Tensor) -> Tensor:
-        return trusted / (1.0 + (left_over / width) ** 2)
-
-    total, weights = torch.zeros_like(observed.residual), trusted
-    decided = torch.zeros_like(total)
-    levels = _levels(error, config)
-    for k, (smoothness, inertia) in enumerate(levels):
-        data = observed.residual - total
-        if k == len(levels) - 1:  # a second right-hand side of ones shows where the correction is decided
-            data = torch.cat([data, torch.ones_like(data)], 1)
-        system = RobustSystem(data, _scaled(observed.links, smoothness), inertia, robust)
-        part, weights = solve_robust(system, weights, REWEIGHTINGS, SOLVER_STEPS)
-        total, decided = total + part[:, :1], part[:, 1:]
+    system = RobustSystem(observed.residual, trusted, width, observed.links, *_levels(error, config))
+    total, _, decided = solve_robust(system, REWEIGHTINGS, SOLVER_STEPS, with_support=True)
+    assert decided is not None  # it was asked for
     size = image_size(depth_m)
     change, support = (
         F.interpolate(field, size, mode="bilinear", align_corners=False, antialias=size < target.size)
@@ -315,15 +287,15 @@ def fit_depth(
     return refined_m.to(depth_m.dtype), support.clamp(0.0, 1.0), total
 
 
-def _levels(error: Tensor, config: GuidanceConfig) -> list[tuple[Tensor, Tensor]]:
-    """Smoothness and inertia ``(B, 1, 1, 1)`` of every pass, from broad to that of the prior's error."""
+def _levels(error: Tensor, config: GuidanceConfig) -> tuple[Tensor, Tensor]:
+    """Smoothness and inertia ``(P, *error.shape)`` of all passes, from broad to that of the prior's error."""
     ratio = REFERENCE_ERROR / error
     last = (config.smoothness * ratio**STIFFNESS_POWER).clamp(LOOSEST, STIFFEST)
     broad = last.clamp_min(BROAD_SMOOTHNESS)
     inertia = (INERTIA * ratio**STIFFNESS_POWER).clamp_max(MOST_INERTIA)
-    levels = []
-    for k in range(PASSES):
-        share = k / (PASSES - 1)
-        least = BROAD_INERTIA ** (1.0 - share) * LEAST_INERTIA**share
-        levels.append((broad ** (1.0 - share) * last**share, inertia.clamp_min(least)))
-    return levels
+    shares = [k / (PASSES - 1) for k in range(PASSES)]
+    least = [BROAD_INERTIA ** (1.0 - share) * LEAST_INERTIA**share for share in shares]
+    return (
+        torch.stack([broad ** (1.0 - share) * last**share for share in shares]),
+        torch.stack([inertia.clamp_min(floor) for floor in least]),
+    )

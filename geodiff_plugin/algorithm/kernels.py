@@ -1,17 +1,15 @@
-"""Triton kernel of the pyramid solver, whose reference is ``algorithm.solver.solve_field``.
+"""Triton kernel of the pyramid solver; its references are ``solve_field`` and ``solve_robust`` of ``solver``.
 
-One launch makes a coarser grid, and one makes all conjugate-gradient steps of a grid. Between the steps
-all programs of the launch wait for each other, so all of them must be on the device at the same time: it is
-launched as a cooperative grid, which CUDA refuses where they do not fit, and never with more programs than
-the bound on registers admits.
+One launch makes all of it: the passes and their rounds of reweighting, the coarser grids, and the
+conjugate-gradient steps on each. Between these stages all programs of the launch wait for each other, so all
+of them must be on the device at the same time: it is launched as a cooperative grid, which CUDA refuses where
+they do not fit, and never with more programs than the bound on registers admits. What some program has
+written in the launch is read past the first cache (``.cg``), which other multiprocessors do not update.
 """
 
 from __future__ import annotations
 
 import functools
-import itertools
-import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -21,87 +19,186 @@ from torch import Tensor
 
 from geodiff_plugin._kernels import launched_on
 from geodiff_plugin.algorithm import solver
-from geodiff_plugin.algorithm.solver import FieldSystem
+from geodiff_plugin.algorithm.solver import FieldSystem, RobustField, RobustSystem
 
-#: Pixels of a tile, of grids of many tiles.
+#: Pixels of a tile.
 TILE = 512
-#: Warps of a program that solves one of them.
+#: Pixels of a grid that one program solves by itself: it waits for no other.
+ALONE = 1024
+#: Warps of a program.
 WARPS = 8
-#: Pixels of the one tile of a grid that a program solves by itself.
-SINGLE_TILE = 1024
-#: Warps of that program.
-SINGLE_WARPS = 8
 #: Registers of a thread at most, and programs that a multiprocessor of 65,536 registers then holds.
-MOST_REGISTERS = 80
+MOST_REGISTERS = 168
 RESIDENT = 65_536 // (MOST_REGISTERS * 32 * WARPS)
-#: Registers of a thread at most, of the one program that solves a grid by itself.
-SINGLE_REGISTERS = 168
 #: The first iterate is zero.
-FROM_ZEROS = 0
-#: It is a field of the same grid.
-FROM_FIELD = 1
-#: It is a field of the next coarser grid.
-FROM_COARSER = 2
-#: Arrays of a field's size that the kernel works with.
-WORK_ARRAYS = 6
-#: Sums that it keeps of every tile.
-SUMS = 3
-#: Counters and tensors begin at multiples of so many numbers: kernels are compiled for aligned addresses.
-ALIGNED = 4
+FROM_ZEROS = tl.constexpr(0)
+#: It is the field that the last round has left on the same grid.
+FROM_FIELD = tl.constexpr(1)
+#: It is the field of the next coarser grid.
+FROM_COARSER = tl.constexpr(2)
+#: Arrays of a field's size that the steps work with.
+WORK_ARRAYS = tl.constexpr(6)
+#: Sums that they keep of every tile.
+SUMS = tl.constexpr(3)
 #: Partial sums that are added at a time.
 GATHERED = tl.constexpr(256)
 #: As ``tiny`` of the reference: a channel that has converged stays where it is.
 TINY = tl.constexpr(1e-20)
 
-_SIZES = ["height", "width", "coarse_height", "coarse_width", "channels", "fields", "steps", "origin"]
-
-
-@triton.jit(do_not_specialize=_SIZES[:5])
-def coarsen_kernel(
-    weight, pull, across, down, weight_2, pull_2, across_2, down_2,
-    height, width, coarse_height, coarse_width, channels,
-    TILE: tl.constexpr,
-):  # fmt: skip
-    """``FieldSystem.coarser``: a program makes a tile of the coarse grid, of one channel."""
-    cell = tl.program_id(0) * TILE + tl.arange(0, TILE)
-    field = tl.program_id(1)
-    sample = field // channels
-    row, column = cell // coarse_width, cell % coarse_width
-    y, x = 2 * row, 2 * column
-    inside = cell < coarse_height * coarse_width
-    below, beside = inside & (y + 1 < height), inside & (x + 1 < width)
-    both = below & beside
-    at = field * height * width + y * width + x
-    total = tl.load(pull + at, inside, 0.0) + tl.load(pull + at + 1, beside, 0.0)
-    total += tl.load(pull + at + width, below, 0.0) + tl.load(pull + at + width + 1, both, 0.0)
-    tl.store(pull_2 + field * coarse_height * coarse_width + cell, total, inside)
-    if field % channels == 0:  # weight and links are shared by the channels
-        at = sample * height * width + y * width + x
-        total = tl.load(weight + at, inside, 0.0) + tl.load(weight + at + 1, beside, 0.0)
-        total += tl.load(weight + at + width, below, 0.0) + tl.load(weight + at + width + 1, both, 0.0)
-        tl.store(weight_2 + sample * coarse_height * coarse_width + cell, total, inside)
-        # From a coarse column to the next: the fine link behind column x + 1, in both rows of the cell.
-        linked = inside & (column + 1 < coarse_width)
-        at = sample * height * (width - 1) + y * (width - 1) + x + 1
-        total = tl.load(across + at, linked, 0.0) + tl.load(across + at + width - 1, linked & below, 0.0)
-        at = sample * coarse_height * (coarse_width - 1) + row * (coarse_width - 1) + column
-        tl.store(across_2 + at, 0.5 * total, linked)
-        linked = inside & (row + 1 < coarse_height)
-        at = sample * (height - 1) * width + (y + 1) * width + x
-        total = tl.load(down + at, linked, 0.0) + tl.load(down + at + 1, linked & beside, 0.0)
-        at = sample * (coarse_height - 1) * coarse_width + cell
-        tl.store(down_2 + at, 0.5 * total, linked)
+_TENSORS = ["data", "weight", "across", "down", "start", "cauchy", "smoothness", "inertia"]
+_WRITTEN = ["field", "support", "weights", "scratch", "arrivals"]
+_SIZES = ["height", "width", "batch", "parts", "levels"]
+_COUNTS = ["most", "passes", "rounds", "first_steps", "steps", "given", "local"]
 
 
 @triton.jit
-def _meet(arrivals, expected, ALONE: tl.constexpr):
-    """Wait until all programs have arrived ``expected / programs`` times, and see what they have stored."""
+def _meet(arrivals, expected, alone):
+    """Wait until all programs have arrived ``expected / programs`` times, and see what they have stored.
+
+    A program that is ``alone`` waits for its own threads only.
+    """
     tl.debug_barrier()
-    if not ALONE:
+    if alone == 0:
         tl.atomic_add(arrivals, 1, sem="release", scope="gpu")
         while tl.atomic_add(arrivals, 0, sem="acquire", scope="gpu") < expected:
             pass
         tl.debug_barrier()
+
+
+@triton.jit
+def _size(height, width, level):
+    """Height and width of a level of the pyramid, of which 0 is the finest."""
+    return (height + (1 << level) - 1) >> level, (width + (1 << level) - 1) >> level
+
+
+@triton.jit
+def _pixels_before(height, width, level):
+    """Pixels of all finer levels."""
+    pixels = 0
+    for finer in range(level):
+        rows, columns = _size(height, width, finer)
+        pixels += rows * columns
+    return pixels
+
+
+@triton.jit
+def _store_links(
+    across, down, smoothness, system, shared, sample, p, height, width, batch, local, ROBUST: tl.constexpr
+):
+    """The links of the finest grid, to the right and down, of every pixel; 0 where it has no neighbour."""
+    n, inside, y = height * width, p < height * width, p // width
+    right, lower = inside & (p - y * width < width - 1), p < n - width
+    to_right = tl.load(across + shared * (n - height) + p - y, right, 0.0)
+    to_lower = tl.load(down + shared * (n - width) + p, lower, 0.0)
+    if ROBUST:  # of a smoothness per pixel the lower one of both ends
+        here = tl.load(smoothness + p * local, inside, 0.0)
+        to_right *= tl.minimum(here, tl.load(smoothness + (p + 1) * local, right, 0.0))
+        to_lower *= tl.minimum(here, tl.load(smoothness + (p + width) * local, lower, 0.0))
+    at = system + (batch + sample) * n + p
+    tl.store(at, to_right, inside)
+    tl.store(at + batch * n, to_lower, inside)
+
+
+@triton.jit
+def _left_over(data, field, x, shared, sample, held, p, n):
+    """The field of the last round, that of the passes before, and what both leave of the data."""
+    inside = p < n
+    u = tl.load(x + sample * held * n + p, inside, 0.0, cache_modifier=".cg")
+    done = tl.load(field + sample * n + p, inside, 0.0, cache_modifier=".cg")
+    return u, done, u - (tl.load(data + shared * n + p, inside, 0.0) - done)
+
+
+@triton.jit
+def _cauchy_weight(weight, cauchy, left_over, shared, sample, p, n):
+    """The weight of observations in the next round."""
+    ratio = left_over / tl.load(cauchy + shared * n + p, p < n, 1.0)
+    return tl.load(weight + sample * n + p, p < n, 0.0) / (1.0 + ratio * ratio)
+
+
+@triton.jit
+def _robust_tile(
+    data,
+    weight,
+    cauchy,
+    inertia,
+    field,
+    system,
+    shared,
+    sample,
+    p,
+    part,
+    turn,
+    n,
+    batch,
+    channels,
+    most,
+    local,
+):
+    """Weight and pull of a round of a pass; a pass begins with what the ones before have left of the data."""
+    inside, own = p < n, sample * n + p
+    weights, done = tl.load(weight + own, inside, 0.0), tl.zeros_like(p).to(tl.float32)
+    if part + turn > 0:
+        # Only the last pass has a second channel, and it has begun only after its first round.
+        held = tl.where(turn > 0, channels, 1)
+        x = system + (3 + most) * batch * n
+        u, done, left_over = _left_over(data, field, x, shared, sample, held, p, n)
+        weights = _cauchy_weight(weight, cauchy, left_over, shared, sample, p, n)
+        done += tl.where(turn > 0, 0.0, u)
+    if turn == 0:
+        tl.store(field + own, done, inside)
+    tl.store(system + own, weights + tl.load(inertia + p * local, inside, 0.0), inside)
+    pull = system + (3 * batch + sample * channels) * n + p
+    tl.store(pull, weights * (tl.load(data + shared * n + p, inside, 0.0) - done), inside)
+    if channels > 1:
+        tl.store(pull + n, weights, inside)
+
+
+@triton.jit
+def _given_tile(data, weight, start, system, sample, p, n, batch, channels, given):
+    """Weight and pull that are given, and the first iterate, if it is."""
+    inside = p < n
+    tl.store(system + sample * n + p, tl.load(weight + sample * n + p, inside, 0.0), inside)
+    for channel in range(channels):
+        at = (sample * channels + channel) * n + p
+        pull = system + 3 * batch * n + at
+        tl.store(pull, tl.load(data + at, inside, 0.0), inside)
+        if given > 0:
+            tl.store(pull + channels * batch * n, tl.load(start + at, inside, 0.0), inside)
+
+
+@triton.jit
+def _cell_sum(fine, y, x, height, width, inside, rows: tl.constexpr, columns: tl.constexpr):
+    """Sums of values at pixels, of those below and beside them, and of both."""
+    at = fine + y * width + x
+    total = tl.load(at, inside & (y < height) & (x < width), 0.0, cache_modifier=".cg")
+    if rows == 2:
+        below = inside & (y + 1 < height) & (x < width)
+        total += tl.load(at + width, below, 0.0, cache_modifier=".cg")
+    if columns == 2:
+        beside = inside & (y < height) & (x + 1 < width)
+        total += tl.load(at + 1, beside, 0.0, cache_modifier=".cg")
+    if rows * columns == 4:
+        both = inside & (y + 1 < height) & (x + 1 < width)
+        total += tl.load(at + width + 1, both, 0.0, cache_modifier=".cg")
+    return total
+
+
+@triton.jit
+def _coarsen_tile(fine, coarse, sample, cell, height, width, batch, channels):
+    """``FieldSystem.coarser``: a tile of the coarse grid."""
+    rows, columns = (height + 1) // 2, (width + 1) // 2
+    n, coarse_n = height * width, rows * columns
+    inside, y, x = cell < coarse_n, 2 * (cell // columns), 2 * (cell % columns)
+    at, of_sample = coarse + sample * coarse_n + cell, fine + sample * n
+    tl.store(at, _cell_sum(of_sample, y, x, height, width, inside, 2, 2), inside)
+    # From a coarse column to the next: the fine link behind column x + 1, in both rows of the cell.
+    linked = _cell_sum(of_sample + batch * n, y, x + 1, height, width, inside, 2, 1)
+    tl.store(at + batch * coarse_n, 0.5 * linked, inside)
+    linked = _cell_sum(of_sample + 2 * batch * n, y + 1, x, height, width, inside, 1, 2)
+    tl.store(at + 2 * batch * coarse_n, 0.5 * linked, inside)
+    for channel in range(sample * channels, (sample + 1) * channels):
+        pull = _cell_sum(fine + (3 * batch + channel) * n, y, x, height, width, inside, 2, 2)
+        tl.store(coarse + (3 * batch + channel) * coarse_n + cell, pull, inside)
 
 
 @triton.jit
@@ -120,273 +217,349 @@ def _enlarged(coarse, y, x, inside, height, width):
     row = tl.maximum((y.to(tl.float32) + 0.5) * 0.5 - 0.5, 0.0)
     column = tl.maximum((x.to(tl.float32) + 0.5) * 0.5 - 0.5, 0.0)
     y0, x0 = row.to(tl.int32), column.to(tl.int32)
-    y1, x1 = tl.minimum(y0 + 1, height - 1), tl.minimum(x0 + 1, width - 1)
     down, right = row - y0.to(tl.float32), column - x0.to(tl.float32)
-    upper = (1.0 - right) * tl.load(coarse + y0 * width + x0, inside, 0.0)
-    upper += right * tl.load(coarse + y0 * width + x1, inside, 0.0)
-    lower = (1.0 - right) * tl.load(coarse + y1 * width + x0, inside, 0.0)
-    lower += right * tl.load(coarse + y1 * width + x1, inside, 0.0)
-    return (1.0 - down) * upper + down * lower
+    beside = tl.minimum(x0 + 1, width - 1) - x0
+    value = tl.zeros_like(row)
+    for lower in range(2):
+        at = coarse + tl.minimum(y0 + lower, height - 1) * width + x0
+        of_row = (1.0 - right) * tl.load(at, inside, 0.0, cache_modifier=".cg")
+        of_row += right * tl.load(at + beside, inside, 0.0, cache_modifier=".cg")
+        value += tl.where(lower > 0, down, 1.0 - down) * of_row
+    return value
 
 
 @triton.jit
-def _neighbours(p, n, width):
-    """Which pixels of a grid have one on the left, on the right, above and below."""
-    inside, column = p < n, p % width
-    return inside & (column > 0), inside & (column < width - 1), inside & (p >= width), p < n - width
+def _row_of_matrix(system, p, n, width, stride):
+    """The system at pixels: its diagonal, and the links to the left, to the right, up and down.
 
-
-@triton.jit
-def _row_of_matrix(weight, across, down, sample, p, n, height, width):
-    """The system at pixels: its diagonal, and the links to the left, to the right, up and down."""
-    left, right, upper, lower = _neighbours(p, n, width)
-    beside = across + sample * (n - height) + p - p // width
-    below = down + sample * (n - width) + p
-    to_left, to_right = tl.load(beside - 1, left, 0.0), tl.load(beside, right, 0.0)
-    to_upper, to_lower = tl.load(below - width, upper, 0.0), tl.load(below, lower, 0.0)
-    links = to_left + to_right + to_upper + to_lower
-    return tl.load(weight + sample * n + p, p < n, 1.0) + links, to_left, to_right, to_upper, to_lower
-
-
-@triton.jit
-def _start_tile(start, x, tile, tiles, n, width, coarse_height, coarse_width, origin, TILE: tl.constexpr):
-    """The first iterate of a tile."""
-    field, p = tile // tiles, (tile % tiles) * TILE + tl.arange(0, TILE)
+    What is left of the first column is the last column of the row above, whose link to the right is 0.
+    """
     inside = p < n
-    value = tl.zeros([TILE], tl.float32)
-    if origin == 1:
-        value = tl.load(start + field * n + p, inside, 0.0)
-    if origin == 2:
-        coarse = start + field * coarse_height * coarse_width
-        value = _enlarged(coarse, p // width, p % width, inside, coarse_height, coarse_width)
-    tl.store(x + field * n + p, value, inside)
+    across = system + stride + p
+    down = across + stride
+    to_left = tl.load(across - 1, inside & (p > 0), 0.0, cache_modifier=".cg")
+    to_right = tl.load(across, inside, 0.0, cache_modifier=".cg")
+    to_upper = tl.load(down - width, inside & (p >= width), 0.0, cache_modifier=".cg")
+    to_lower = tl.load(down, inside, 0.0, cache_modifier=".cg")
+    weight = tl.load(system + p, inside, 1.0, cache_modifier=".cg")
+    return weight + (to_left + to_right + to_upper + to_lower), to_left, to_right, to_upper, to_lower
 
 
 @triton.jit
-def _residual_tile(
-    weight, pull, across, down, x, work, now, tile, tiles, n, height, width, channels, area,
-    TILE: tl.constexpr,
-):  # fmt: skip
+def _value_at(values, p, n):
+    """Values of a field at pixels, 0 outside of it."""
+    return tl.load(values + p, (p >= 0) & (p < n), 0.0, cache_modifier=".cg")
+
+
+@triton.jit
+def _start_tile(x, coarse_x, origin, p, n, height, width):
+    """The first iterate of a tile, if it is not there yet."""
+    value = tl.zeros_like(p).to(tl.float32)
+    if origin == FROM_COARSER:
+        value = _enlarged(coarse_x, p // width, p % width, p < n, (height + 1) // 2, (width + 1) // 2)
+    if origin != FROM_FIELD:
+        tl.store(x + p, value, p < n)
+
+
+@triton.jit
+def _residual_tile(system, pull, x, work, now, p, n, width, stride, area):
     """The first residual of a tile, preconditioned as well, the inverse of the diagonal, and their sum."""
-    field, p = tile // tiles, (tile % tiles) * TILE + tl.arange(0, TILE)
-    inside, own = p < n, field * n + p
-    left, right, upper, lower = _neighbours(p, n, width)
-    diagonal, to_left, to_right, to_upper, to_lower = _row_of_matrix(
-        weight, across, down, field // channels, p, n, height, width
-    )
-    at = x + own
-    rest = tl.load(pull + own, inside, 0.0) - diagonal * tl.load(at, inside, 0.0, cache_modifier=".cg")
-    rest += to_left * tl.load(at - 1, left, 0.0, cache_modifier=".cg")
-    rest += to_right * tl.load(at + 1, right, 0.0, cache_modifier=".cg")
-    rest += to_upper * tl.load(at - width, upper, 0.0, cache_modifier=".cg")
-    rest += to_lower * tl.load(at + width, lower, 0.0, cache_modifier=".cg")
-    tl.store(work + own, rest, inside)
-    tl.store(work + area + own, rest / diagonal, inside)
-    tl.store(work + 3 * area + own, 1.0 / diagonal, inside)
-    tl.store(now + tile, tl.sum(tl.where(inside, rest * rest / diagonal, 0.0), 0))
+    inside = p < n
+    diagonal, to_left, to_right, to_upper, to_lower = _row_of_matrix(system, p, n, width, stride)
+    rest = _value_at(pull, p, n) - diagonal * _value_at(x, p, n)
+    rest += to_left * _value_at(x, p - 1, n)
+    rest += to_right * _value_at(x, p + 1, n)
+    rest += to_upper * _value_at(x, p - width, n)
+    rest += to_lower * _value_at(x, p + width, n)
+    tl.store(work + p, rest, inside)
+    tl.store(work + area + p, rest / diagonal, inside)
+    tl.store(work + 3 * area + p, 1.0 / diagonal, inside)
+    tl.store(now, tl.sum(tl.where(inside, rest * rest / diagonal, 0.0), 0))
 
 
 @triton.jit
-def _direction_at(scaled, old, p, inside, share, step):
+def _direction_at(work, area, p, n, share, step):
     """The new direction at pixels: the preconditioned residual, and a share of the direction before."""
-    here = tl.load(scaled + p, inside, 0.0, cache_modifier=".cg")
+    inside = (p >= 0) & (p < n)
+    here = tl.load(work + area + p, inside, 0.0, cache_modifier=".cg")
+    old = work + (5 - step % 2) * area
     return here + share * tl.load(old + p, inside & (step > 0), 0.0, cache_modifier=".cg")
 
 
 @triton.jit
-def _direction_tile(
-    weight, across, down, work, partial, step, tile, tiles, count, n, height, width, channels, area,
-    TILE: tl.constexpr,
-):  # fmt: skip
+def _direction_tile(system, work, partial, step, tile, tiles, count, p, n, width, stride, area):
     """The direction of a step in a tile, its image under the matrix, and the sum of their product."""
-    field, p = tile // tiles, (tile % tiles) * TILE + tl.arange(0, TILE)
-    inside, base = p < n, field * n
-    left, right, upper, lower = _neighbours(p, n, width)
-    diagonal, to_left, to_right, to_upper, to_lower = _row_of_matrix(
-        weight, across, down, field // channels, p, n, height, width
-    )
-    share = _total(partial + (step % 2) * count + field * tiles, tiles)
-    share /= tl.maximum(_total(partial + ((step + 1) % 2) * count + field * tiles, tiles), TINY)
+    inside = p < n
+    share = _total(partial + (step % 2) * count, tiles)
+    share /= tl.maximum(_total(partial + ((step + 1) % 2) * count, tiles), TINY)
     share = tl.where(step > 0, share, 0.0)  # there is no step before the first
+    diagonal, to_left, to_right, to_upper, to_lower = _row_of_matrix(system, p, n, width, stride)
     # The direction of the step before is read by other programs while the new one is written.
-    z, old = work + area + base, work + (5 - step % 2) * area + base
-    here = _direction_at(z, old, p, inside, share, step)
+    here = _direction_at(work, area, p, n, share, step)
     value = diagonal * here
-    value -= to_left * _direction_at(z, old, p - 1, left, share, step)
-    value -= to_right * _direction_at(z, old, p + 1, right, share, step)
-    value -= to_upper * _direction_at(z, old, p - width, upper, share, step)
-    value -= to_lower * _direction_at(z, old, p + width, lower, share, step)
-    tl.store(work + (4 + step % 2) * area + base + p, here, inside)
-    tl.store(work + 2 * area + base + p, value, inside)
+    value -= to_left * _direction_at(work, area, p - 1, n, share, step)
+    value -= to_right * _direction_at(work, area, p + 1, n, share, step)
+    value -= to_upper * _direction_at(work, area, p - width, n, share, step)
+    value -= to_lower * _direction_at(work, area, p + width, n, share, step)
+    tl.store(work + (4 + step % 2) * area + p, here, inside)
+    tl.store(work + 2 * area + p, value, inside)
     tl.store(partial + 2 * count + tile, tl.sum(tl.where(inside, here * value, 0.0), 0))
 
 
 @triton.jit
-def _update_tile(x, work, partial, step, tile, tiles, count, n, area, TILE: tl.constexpr):
+def _update_tile(x, work, partial, step, tile, tiles, count, p, n, area):
     """Iterate and residual of a tile after the step along its direction, and the residual's sum."""
-    field, p = tile // tiles, (tile % tiles) * TILE + tl.arange(0, TILE)
-    inside, own = p < n, field * n + p
-    length = _total(partial + (step % 2) * count + field * tiles, tiles)
-    length /= tl.maximum(_total(partial + 2 * count + field * tiles, tiles), TINY)
-    moved = tl.load(x + own, inside, 0.0, cache_modifier=".cg")
-    moved += length * tl.load(work + (4 + step % 2) * area + own, inside, 0.0, cache_modifier=".cg")
-    rest = tl.load(work + own, inside, 0.0, cache_modifier=".cg")
-    rest -= length * tl.load(work + 2 * area + own, inside, 0.0, cache_modifier=".cg")
-    z = rest * tl.load(work + 3 * area + own, inside, 0.0, cache_modifier=".cg")
-    tl.store(x + own, moved, inside)
-    tl.store(work + own, rest, inside)
-    tl.store(work + area + own, z, inside)
+    inside = p < n
+    length = _total(partial + (step % 2) * count, tiles)
+    length /= tl.maximum(_total(partial + 2 * count, tiles), TINY)
+    moved = _value_at(x, p, n) + length * _value_at(work + (4 + step % 2) * area, p, n)
+    tl.store(x + p, moved, inside)
+    rest = _value_at(work, p, n) - length * _value_at(work + 2 * area, p, n)
+    z = rest * _value_at(work + 3 * area, p, n)
+    tl.store(work + p, rest, inside)
+    tl.store(work + area + p, z, inside)
     tl.store(partial + ((step + 1) % 2) * count + tile, tl.sum(tl.where(inside, rest * z, 0.0), 0))
 
 
-@triton.jit(do_not_specialize=_SIZES)
-def conjugate_gradients_kernel(
-    weight, pull, across, down, start, x, work, partial, arrivals,
-    height, width, coarse_height, coarse_width, channels, fields, steps, origin,
+@triton.jit
+def _conjugate_gradients(
+    system, work, arrivals, expected, origin, steps, height, width, batch, channels, most,
     TILE: tl.constexpr, ALONE: tl.constexpr,
 ):  # fmt: skip
-    """All steps on one grid; the programs share the tiles of all ``fields``, ``B * C`` of them.
+    """All steps on one grid, whose field is then seen by all programs; the arrivals expected after them.
 
-    With ``ALONE`` a field is one tile and has a program of its own; otherwise all programs meet twice a step.
+    The programs share the tiles of every field, or, where a field is small, the fields, and meet at the end.
     ``work`` holds residual, preconditioned residual, image of the direction, inverse of the diagonal, and the
-    directions of even and of odd steps; ``partial`` one sum a tile: the residual's of even and of odd steps,
-    and that of a direction with its image.
+    directions of even and of odd steps; then one sum a tile: the residual's of even and of odd steps, and
+    that of a direction with its image.
+    """
+    programs, n, fields = tl.num_programs(0), height * width, batch * channels
+    tiles, stride, area, alone = tl.cdiv(n, TILE), batch * n, n * fields, (n <= ALONE).to(tl.int32)
+    first = tl.where(alone > 0, tl.program_id(0), 0)
+    apart = tl.where(alone > 0, programs, 1)  # from a field of this program to its next one
+    begin, every = (tl.program_id(0) - first) * TILE, (programs + 1 - apart) * TILE
+    arriving = (1 - alone) * programs
+    pull, x = system + 3 * stride, system + (3 + most) * stride
+    coarse_x = x + most * stride + (3 + most) * batch * ((height + 1) // 2) * ((width + 1) // 2)
+    partial = work + WORK_ARRAYS * area
+    for field in range(first, fields, apart):
+        coarse = coarse_x + field * ((height + 1) // 2) * ((width + 1) // 2)
+        for at in range(begin, n, every):
+            p = at + tl.arange(0, TILE)
+            _start_tile(x + field * n, coarse, origin, p, n, height, width)
+    expected += arriving
+    _meet(arrivals, expected, alone)
+    for field in range(first, fields, apart):
+        of_sample, own = system + (field // channels) * n, field * n
+        for at in range(begin, n, every):
+            p, now = at + tl.arange(0, TILE), partial + field * tiles + at // TILE
+            _residual_tile(of_sample, pull + own, x + own, work + own, now, p, n, width, stride, area)
+    for step in range(steps):
+        expected += arriving
+        _meet(arrivals, expected, alone)
+        for field in range(first, fields, apart):
+            of_sample, sums = system + (field // channels) * n, partial + field * tiles
+            for at in range(begin, n, every):
+                _direction_tile(
+                    of_sample, work + field * n, sums, step, at // TILE, tiles, fields * tiles,
+                    at + tl.arange(0, TILE), n, width, stride, area,
+                )  # fmt: skip
+        expected += arriving
+        _meet(arrivals, expected, alone)
+        for field in range(first, fields, apart):
+            own, sums = field * n, partial + field * tiles
+            for at in range(begin, n, every):
+                p = at + tl.arange(0, TILE)
+                _update_tile(x + own, work + own, sums, step, at // TILE, tiles, fields * tiles, p, n, area)
+    expected += programs
+    _meet(arrivals, expected, 0)
+    return expected
+
+
+@triton.jit
+def _coarsen(scratch, arrivals, expected, height, width, batch, channels, stored, levels, TILE: tl.constexpr):
+    """The systems of all coarser grids; the arrivals expected after them."""
+    first, programs = tl.program_id(0), tl.num_programs(0)
+    for finer in range(levels - 1):
+        rows, columns = _size(height, width, finer)
+        fine = scratch + stored * _pixels_before(height, width, finer)
+        coarse = fine + stored * rows * columns
+        tiles = tl.cdiv(((rows + 1) // 2) * ((columns + 1) // 2), TILE)
+        for tile in range(first, tiles * batch, programs):
+            cell = (tile % tiles) * TILE + tl.arange(0, TILE)
+            _coarsen_tile(fine, coarse, tile // tiles, cell, rows, columns, batch, channels)
+        expected += programs
+        _meet(arrivals, expected, 0)
+    return expected
+
+
+@triton.jit
+def _finish_tile(
+    data, weight, cauchy, x, field, support, weights, shared, sample, p, n, most, ROBUST: tl.constexpr
+):
+    """What a launch returns."""
+    inside, own = p < n, sample * n + p
+    if ROBUST:
+        u, done, left_over = _left_over(data, field, x, shared, sample, most, p, n)
+        tl.store(weights + own, _cauchy_weight(weight, cauchy, left_over, shared, sample, p, n), inside)
+        tl.store(field + own, done + u, inside)
+        if most > 1:
+            decided = tl.load(x + (sample * most + 1) * n + p, inside, 0.0, cache_modifier=".cg")
+            tl.store(support + own, decided, inside)
+    else:
+        for channel in range(sample * most, (sample + 1) * most):
+            u = tl.load(x + channel * n + p, inside, 0.0, cache_modifier=".cg")
+            tl.store(field + channel * n + p, u, inside)
+
+
+@triton.jit(do_not_specialize=_SIZES + _COUNTS, do_not_specialize_on_alignment=_TENSORS + _WRITTEN)
+def solve_kernel(
+    data, weight, across, down, start, cauchy, smoothness, inertia,
+    field, support, weights, scratch, arrivals,
+    height, width, batch, parts, levels, most, passes, rounds, first_steps, steps, given, local,
+    ROBUST: tl.constexpr, TILE: tl.constexpr, ALONE: tl.constexpr,
+):  # fmt: skip
+    """All passes of ``solve_robust``, or ``solve_field``, whose ``weight`` and pull ``data`` are given.
+
+    ``scratch`` has of every level, the finest first, weight, links across and down, pull and field, and then
+    what ``_conjugate_gradients`` works with. Parts of fewer samples than the ``batch`` hold for the rest in
+    turn. Every sample has ``most`` fields, one in all passes but the last.
     """
     first, programs, n = tl.program_id(0), tl.num_programs(0), height * width
-    tiles = tl.cdiv(n, TILE)
-    count, area = tiles * fields, n * fields
-    for tile in range(first, count, programs):
-        _start_tile(start, x, tile, tiles, n, width, coarse_height, coarse_width, origin, TILE)
-    expected = programs
-    _meet(arrivals, expected, ALONE)
-    for tile in range(first, count, programs):
-        _residual_tile(
-            weight, pull, across, down, x, work, partial, tile, tiles, n, height, width, channels, area, TILE
-        )
-    expected += programs
-    _meet(arrivals, expected, ALONE)
-    for step in range(steps):
-        for tile in range(first, count, programs):
-            _direction_tile(
-                weight, across, down, work, partial, step, tile, tiles, count, n, height, width, channels,
-                area, TILE,
+    tiles, stored, expected = tl.cdiv(n, TILE), (3 + 2 * most) * batch, 0
+    work = scratch + stored * _pixels_before(height, width, levels)
+    for turn in range(passes * rounds):
+        part, again = turn // rounds, turn % rounds
+        channels = tl.where(part < passes - 1, 1, most)
+        for tile in range(first, tiles * batch, programs):
+            sample, p = tile // tiles, (tile % tiles) * TILE + tl.arange(0, TILE)
+            shared = sample % parts
+            of_pass = (part * parts + shared) * (1 + (n - 1) * local)
+            _store_links(
+                across, down, smoothness + of_pass, scratch, shared, sample, p, height, width, batch, local,
+                ROBUST,
             )  # fmt: skip
+            if ROBUST:
+                _robust_tile(
+                    data, weight, cauchy, inertia + of_pass, field, scratch, shared, sample, p, part, again,
+                    n, batch, channels, most, local,
+                )  # fmt: skip
+            else:
+                _given_tile(data, weight, start, scratch, sample, p, n, batch, channels, given)
         expected += programs
-        _meet(arrivals, expected, ALONE)
-        for tile in range(first, count, programs):
-            _update_tile(x, work, partial, step, tile, tiles, count, n, area, TILE)
-        expected += programs
-        _meet(arrivals, expected, ALONE)
+        _meet(arrivals, expected, 0)
+        fresh = (again + given) == 0
+        top = tl.where(fresh, levels, 1)
+        expected = _coarsen(scratch, arrivals, expected, height, width, batch, channels, stored, top, TILE)
+        for above in range(top):
+            rows, columns = _size(height, width, top - 1 - above)
+            system = scratch + stored * _pixels_before(height, width, top - 1 - above)
+            coarsest = fresh & (above == 0)
+            origin = tl.where(above > 0, FROM_COARSER, tl.where(coarsest, FROM_ZEROS, FROM_FIELD))
+            expected = _conjugate_gradients(
+                system, work, arrivals, expected, origin, tl.where(coarsest, first_steps, steps), rows,
+                columns, batch, channels, most, TILE, ALONE,
+            )  # fmt: skip
+    x = scratch + (3 + most) * batch * n
+    for tile in range(first, tiles * batch, programs):
+        sample, p = tile // tiles, (tile % tiles) * TILE + tl.arange(0, TILE)
+        shared = sample % parts
+        _finish_tile(data, weight, cauchy, x, field, support, weights, shared, sample, p, n, most, ROBUST)
 
 
 @functools.cache
 def _most_programs(device: torch.device) -> int:
-    """Programs of a grid of many tiles that a device holds at the same time; in the interpreter one runs."""
+    """Programs that a device holds at the same time; in the interpreter one runs."""
     if device.type != "cuda":
         return 1
     return RESIDENT * torch.cuda.get_device_properties(device).multi_processor_count
 
 
-def _empty(like: Tensor, *shapes: tuple[int, ...]) -> list[Tensor]:
-    """Tensors in one allocation, each of which begins at an address that a kernel is compiled for once."""
-    begins = list(itertools.accumulate((_aligned(math.prod(shape)) for shape in shapes), initial=0))
-    buffer = like.new_empty(begins[-1])
-    return [buffer.as_strided(s, _strides(s), first) for s, first in zip(shapes, begins, strict=False)]
+class _Read(NamedTuple):
+    """What a launch reads; a part that it does not need is any tensor."""
+
+    data: Tensor  # (parts, 1, H, W), or the pull (B, C, H, W)
+    weight: Tensor  # (B, 1, H, W)
+    across: Tensor  # (parts, 1, H, W - 1)
+    down: Tensor  # (parts, 1, H - 1, W)
+    start: Tensor  # as the field
+    cauchy: Tensor  # (parts, 1, H, W)
+    smoothness: Tensor  # (passes, parts, 1, H, W), or of pixels (1, 1)
+    inertia: Tensor  # as smoothness
 
 
-def _aligned(count: int) -> int:
-    return -(-count // ALIGNED) * ALIGNED
+class _Counts(NamedTuple):
+    """What a launch does."""
+
+    channels: int
+    passes: int
+    rounds: int
+    first_steps: int
+    steps: int
+    given: bool  # whether ``start`` is
+    local: bool  # whether there is a smoothness per pixel
 
 
-def _strides(shape: tuple[int, ...]) -> list[int]:
-    """Of a contiguous tensor."""
-    return [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
-
-
-class _Grid(NamedTuple):
-    """One grid of the pyramid: its system, and what the steps on it write."""
-
-    system: FieldSystem
-    x: Tensor  # (B, C, H, W) the field
-    work: Tensor
-    partial: Tensor  # sums of every tile
-
-
-def _is_alone(n: int) -> bool:
-    """Whether a field of so many pixels is one tile, whose program meets no other."""
-    return n <= SINGLE_TILE
-
-
-def _tiles(shape: Sequence[int]) -> int:
-    """Tiles of all fields ``(B, C, H, W)``."""
-    n = shape[2] * shape[3]
-    return triton.cdiv(n, SINGLE_TILE if _is_alone(n) else TILE) * shape[0] * shape[1]
-
-
-def _grids(finest: FieldSystem, coarser: bool) -> list[_Grid]:
-    """The pyramid from the finest grid on, in one allocation; that grid alone if not ``coarser``."""
-    batch, channels, height, width = finest.pull.shape
+def _sizes(height: int, width: int, levels: bool) -> list[tuple[int, int]]:
+    """Height and width of the grids of a pyramid, the finest first; of that one alone if not ``levels``."""
     sizes = [(height, width)]
-    while coarser and min(sizes[-1]) > solver.COARSEST_SIDE:
+    while levels and min(sizes[-1]) > solver.COARSEST_SIDE:
         sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
-    shapes = list[tuple[int, ...]]()
-    for h, w in sizes:
-        fields = (batch, channels, h, w)
-        shapes += [fields, (WORK_ARRAYS * math.prod(fields),), (SUMS * _tiles(fields),)]
-    for h, w in sizes[1:]:
-        shapes += [(batch, 1, h, w), (batch, channels, h, w), (batch, 1, h, w - 1), (batch, 1, h - 1, w)]
-    tensors = iter(_empty(finest.pull, *shapes))
-    written = [tuple(itertools.islice(tensors, 3)) for _ in sizes]
-    systems = [finest, *(FieldSystem(*itertools.islice(tensors, 4)) for _ in sizes[1:])]
-    for fine, coarse in itertools.pairwise(systems):
-        _coarsen(fine, coarse)
-    return [_Grid(system, *tensors) for system, tensors in zip(systems, written, strict=True)]
+    return sizes
 
 
-def _coarsen(system: FieldSystem, coarse: FieldSystem) -> None:
-    """Write ``FieldSystem.coarser`` of tensors that are contiguous."""
-    batch, channels, height, width = system.pull.shape
-    h, w = coarse.pull.shape[-2:]
-    launched_on(system.pull, coarsen_kernel[(triton.cdiv(h * w, TILE), batch * channels)])(
-        *vars(system).values(), *vars(coarse).values(), height, width, h, w, channels, TILE=TILE
-    )
-
-
-def _conjugate_gradients(grid: _Grid, start: Tensor | None, steps: int, arrivals: Tensor) -> Tensor:
-    """The field after all steps; ``start`` is of this grid, or of the next coarser one."""
-    system = grid.system
-    batch, channels, height, width = system.pull.shape
-    if start is None:
-        origin, start = FROM_ZEROS, system.pull
-    else:
-        origin = FROM_FIELD if start.shape[-2:] == system.pull.shape[-2:] else FROM_COARSER
-    fields, alone = batch * channels, _is_alone(height * width)
-    tile, warps = (SINGLE_TILE, SINGLE_WARPS) if alone else (TILE, WARPS)
-    programs = fields if alone else min(_tiles(system.pull.shape), _most_programs(start.device))
-    options = {"num_warps": warps}
-    if start.is_cuda:  # the interpreter knows neither
-        options |= {"maxnreg": SINGLE_REGISTERS if alone else MOST_REGISTERS}
-        options |= {} if alone else {"launch_cooperative_grid": True}
-    launched_on(start, conjugate_gradients_kernel[(programs,)])(
-        *vars(system).values(), start, grid.x, grid.work, grid.partial, arrivals,
-        height, width, *start.shape[-2:], channels, fields, steps, origin,
-        TILE=tile, ALONE=alone, **options,
+def _launch(read: _Read, written: tuple[Tensor, Tensor, Tensor], counts: _Counts, robust: bool) -> None:
+    """``solve_kernel`` into field, support and weights; the latter two are those of ``robust`` solves."""
+    batch, _, height, width = read.weight.shape
+    pixels = [rows * columns for rows, columns in _sizes(height, width, not counts.given)]
+    fields = batch * counts.channels
+    tiles = triton.cdiv(pixels[0], TILE) * fields
+    stored = (3 * batch + 2 * fields) * sum(pixels)
+    scratch = read.data.new_empty(stored + WORK_ARRAYS.value * fields * pixels[0] + SUMS.value * tiles)
+    arrivals = torch.zeros(1, dtype=torch.int32, device=scratch.device)
+    options = {"num_warps": WARPS}
+    if scratch.is_cuda:  # the interpreter knows neither
+        options |= {"maxnreg": MOST_REGISTERS, "launch_cooperative_grid": True}
+    launched_on(scratch, solve_kernel[(min(tiles, _most_programs(scratch.device)),)])(
+        *read, *written, scratch, arrivals,
+        height, width, batch, len(read.across), len(pixels), *map(int, counts),
+        ROBUST=robust, TILE=TILE, ALONE=ALONE, **options,
     )  # fmt: skip
-    return grid.x
 
 
-def _of_batch(part: Tensor, pull: Tensor) -> Tensor:
-    """A part of a system, contiguous, with as many samples as ``pull``."""
-    return (part if len(part) == len(pull) else part.expand(len(pull), -1, -1, -1)).contiguous()
+def _of_batch(part: Tensor, samples: int) -> Tensor:
+    """A part of a system, contiguous, of so many samples."""
+    return (part if len(part) == samples else part.expand(samples, -1, -1, -1)).contiguous()
 
 
 def solve_field(system: FieldSystem, steps: int, start: Tensor | None) -> Tensor:
-    """``solver.solve_field`` by kernels: the same steps on the same grids."""
-    finest = FieldSystem(*(_of_batch(part, system.pull) for part in vars(system).values()))
-    grids = _grids(finest, coarser=start is None)
-    arrivals = torch.zeros(len(grids), ALIGNED, dtype=torch.int32, device=system.pull.device)
-    field = None if start is None else start.contiguous()
-    for grid, counter in zip(reversed(grids), arrivals, strict=True):
-        field = _conjugate_gradients(grid, field, solver.COARSEST_STEPS if field is None else steps, counter)
-    assert field is not None  # there is one level at least
+    """``solver.solve_field`` by the kernel: the same steps on the same grids."""
+    pull = system.pull.contiguous()
+    (batch, channels), field = pull.shape[:2], torch.empty_like(pull)
+    weight, across, down = (
+        _of_batch(system.weight, batch),
+        system.across.contiguous(),
+        system.down.contiguous(),
+    )
+    first = pull if start is None else start.contiguous()
+    counts = _Counts(channels, 1, 1, solver.COARSEST_STEPS, steps, start is not None, local=False)
+    unused = pull
+    read = _Read(pull, weight, across, down, first, unused, unused, unused)
+    _launch(read, (field, unused, unused), counts, robust=False)
     return field
+
+
+def solve_robust(system: RobustSystem, rounds: int, steps: int, with_support: bool) -> RobustField:
+    """``solver.solve_robust`` by the kernel."""
+    data, trusted = system.data.contiguous(), system.trusted.contiguous()
+    parts, (across, down) = len(data), (_of_batch(link, len(data)) for link in system.links)
+    field, weights = torch.empty_like(trusted), torch.empty_like(trusted)
+    support = torch.empty_like(trusted) if with_support else None
+    stiffness, inertia = (
+        part.expand(-1, parts, -1, -1, -1).contiguous() for part in (system.smoothness, system.inertia)
+    )
+    read = _Read(data, trusted, across, down, data, system.width.contiguous(), stiffness, inertia)
+    local, channels = stiffness.shape[-2:] != (1, 1), 1 + with_support
+    counts = _Counts(channels, len(stiffness), rounds, solver.COARSEST_STEPS, steps, False, local)
+    _launch(read, (field, weights if support is None else support, weights), counts, robust=True)
+    return RobustField(field, weights, support)

@@ -5,8 +5,8 @@ A screened Poisson equation, solved on a pyramid (cascadic multigrid, Bornemann 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -109,29 +109,70 @@ def _conjugate_gradients(system: FieldSystem, x: Tensor, steps: int) -> Tensor:
 
 @dataclass(frozen=True)
 class RobustSystem:
-    """The minimiser of ``sum rho(u - data) + sum link |grad u|^2 + inertia sum u^2``.
+    """Observations ``r`` of a field, which is found in passes, each of what the passes before have left.
 
-    ``rho`` grows more slowly than a square, so that what contradicts the rest counts for less. ``data (B, C,
-    H, W)`` are the observations, ``links`` go across and down as in ``FieldSystem``, ``inertia (B, 1, 1, 1)``
-    pulls towards 0. ``robust`` takes the residuals ``(B, 1, H, W)`` of the first channel to the weights
-    ``rho'(r) / 2 r`` of the next round of least squares, which further channels share.
+    A pass minimises ``sum t w^2 log(1 + (u - r)^2 / w^2) + sum a g |grad u|^2 + sum b u^2``. Its first term
+    grows more slowly than a square, so that what contradicts the rest counts for less.
+
+    Attributes:
+        data: ``r (B, 1, H, W)``.
+        trusted: ``t (B, 1, H, W)``, the weight of an observation that is met. Of ``n B`` samples it is ``n``
+            sets of weights, one after the other, for the same observations.
+        width: ``w (B, 1, H, W)``, the residual at which an observation counts half.
+        links: ``g``, across and down as in ``FieldSystem``.
+        smoothness: ``a`` of every pass, ``(P, B, 1, 1, 1)``, or ``(P, B, 1, H, W)``: between two pixels the
+            lower one of both holds.
+        inertia: ``b`` of every pass, of one shape with the smoothness.
     """
 
     data: Tensor
+    trusted: Tensor
+    width: Tensor
     links: tuple[Tensor, Tensor]
+    smoothness: Tensor
     inertia: Tensor
-    robust: Callable[[Tensor], Tensor]
 
 
-def solve_robust(system: RobustSystem, weights: Tensor, rounds: int, steps: int) -> tuple[Tensor, Tensor]:
-    """The field of iteratively reweighted least squares, and the weights for one more round.
+class RobustField(NamedTuple):
+    """What ``solve_robust`` finds, ``(B, 1, H, W)`` each, of as many samples as there are weights."""
 
-    ``weights (B, 1, H, W)`` are those of the first of ``rounds >= 1``; ``steps`` as for ``solve_field``.
+    field: Tensor  # the sum of all passes
+    weights: Tensor  # of the observations, at the last residuals
+    support: Tensor | None  # the field of the last pass for observations of 1: how far it is decided by them
+
+
+def solve_robust(system: RobustSystem, rounds: int, steps: int, *, with_support: bool = False) -> RobustField:
+    """The field of all passes, each by ``rounds >= 1`` of iteratively reweighted least squares.
+
+    The first round of the first pass trusts every observation, that of a later one starts with the weights of
+    the pass before. ``steps`` are those of ``solve_field``, whose field the next round starts from.
     """
-    field: Tensor | None = None
-    for _ in range(rounds):
-        least_squares = FieldSystem(weights + system.inertia, weights * system.data, *system.links)
-        field = solve_field(least_squares, steps, field)
-        weights = system.robust(field[:, :1] - system.data[:, :1])
-    assert field is not None
-    return field, weights
+    if use_kernel(system.data):
+        from geodiff_plugin.algorithm import kernels
+
+        return kernels.solve_robust(system, rounds, steps, with_support)
+    sets = len(system.trusted) // len(system.data)
+    observed, width = (part.repeat(sets, 1, 1, 1) for part in (system.data, system.width))
+    total, weights, solved = torch.zeros_like(observed), system.trusted, observed
+    passes = list(zip(system.smoothness, system.inertia, strict=True))
+    for k, (smoothness, inertia) in enumerate(passes):
+        data, start = observed - total, None
+        if with_support and k == len(passes) - 1:
+            data = torch.cat([data, torch.ones_like(data)], 1)
+        across, down = (link.repeat(sets, 1, 1, 1) for link in scaled_links(system.links, smoothness))
+        held = inertia.repeat(sets, 1, 1, 1)
+        for _ in range(rounds):
+            solved = solve_field(FieldSystem(weights + held, weights * data, across, down), steps, start)
+            left_over, start = solved[:, :1] - data[:, :1], solved
+            weights = system.trusted / (1.0 + (left_over / width) ** 2)
+        total = total + solved[:, :1]
+    return RobustField(total, weights, solved[:, 1:] if with_support else None)
+
+
+def scaled_links(links: tuple[Tensor, Tensor], smoothness: Tensor) -> tuple[Tensor, Tensor]:
+    """Links times a smoothness ``(B, 1, 1, 1)``, or ``(B, 1, H, W)``: the lower one of both ends."""
+    if smoothness.shape[-2:] != (1, 1):
+        across = torch.minimum(smoothness[..., 1:], smoothness[..., :-1])
+        down = torch.minimum(smoothness[..., 1:, :], smoothness[..., :-1, :])
+        return across * links[0], down * links[1]
+    return smoothness * links[0], smoothness * links[1]

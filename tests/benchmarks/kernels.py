@@ -140,16 +140,12 @@ def _of_the_scale() -> Iterator[Compiled]:
 
 
 def _of_the_solver() -> Iterator[Compiled]:
-    coarsen = 8 * "*fp32 " + 5 * " i32"
-    yield Compiled("coarser grid", algorithm.coarsen_kernel, coarsen, {"TILE": algorithm.TILE}, 4)
-    kernel, solve = algorithm.conjugate_gradients_kernel, 8 * "*fp32 " + "*i32" + 8 * " i32"
-    sizes: dict[str, Any] = {"TILE": algorithm.TILE, "ALONE": False}
+    solve = 12 * "*fp32 " + "*i32" + 12 * " i32"
     options = {"maxnreg": algorithm.MOST_REGISTERS, "launch_cooperative_grid": True}
-    many = solve, sizes, algorithm.WARPS, options, algorithm.RESIDENT
-    yield Compiled("conjugate gradients", kernel, *many)
-    sizes = {"TILE": algorithm.SINGLE_TILE, "ALONE": True}
-    alone = {"maxnreg": algorithm.SINGLE_REGISTERS}
-    yield Compiled("conjugate gradients, one tile", kernel, solve, sizes, algorithm.SINGLE_WARPS, alone)
+    for robust, name in ((False, "fields"), (True, "robust fields")):
+        sizes = {"ROBUST": robust, "TILE": algorithm.TILE, "ALONE": algorithm.ALONE}
+        many = solve, sizes, algorithm.WARPS, options, algorithm.RESIDENT
+        yield Compiled(name, algorithm.solve_kernel, *many)
 
 
 def resources(launch: Compiled, architecture: int) -> tuple[int, int]:
