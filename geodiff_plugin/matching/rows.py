@@ -126,4 +126,4 @@ def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: fl
     shift = np.nan_to_num(fill_background(np.where(known, shift, np.float32(np.nan))))
     maps = np.stack([shift, known, between & ~known])
     shift_on, matched, filled = to_device_of(left_01, maps[..., ::-1] if mirrored else maps)
-    return RowMatches(shift_on, matched, filled, torch.tensor(abs(T[0, 3])))
+    return RowMatches(shift_on, matched, filled, torch.tensor(abs(T[0, 3]), device="cpu"))

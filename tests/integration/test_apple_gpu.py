@@ -59,8 +59,8 @@ def _outermost_of_cameras(frame: Any) -> str:
 @pytest.mark.parametrize(
     ("prior", "knobs"),
     [
-        ("bundled", {"inner_steps": 1}),
-        ("bundled", {"inner_steps": 1, "gradient": "full"}),
+        ("bundled", {"inner_steps": 1, "min_steps": 2}),
+        ("bundled", {"inner_steps": 1, "min_steps": 2, "gradient": "full"}),
         ("map", {}),
     ],
 )
