@@ -243,9 +243,10 @@ MUTANTS = [
     ),
     *of(
         "result/confidence.py",
-        ("(-0.228, 0.788, 2.42, 0.0864, -15.0)", "(-0.328, 0.788, 2.42, 0.0864, -15.0)"),
-        ("(-0.228, 0.788, 2.42, 0.0864, -15.0)", "(-0.228, 0.788, 2.42, 0.0864, -12.0)"),
-        ("_HALF_KNOWN = 0.1", "_HALF_KNOWN = 0.12"),
+        ("0.94, -15.0)", "-0.94, -15.0)"),
+        ("0.94, -15.0)", "0.94, 15.0)"),
+        ("\nFEW = 0.02", "\nFEW = 0.03"),
+        ("\nHALF_KNOWN = 0.1", "\nHALF_KNOWN = 0.12"),
         ("torch.minimum(best, error), best)", "error, best)"),
         (
             "matched = match_exposure(warped[:, channels], left_01[:, channels], seen)",

@@ -123,8 +123,8 @@ def _disagreement(view: AlignedView, other: Tensor, position: Tensor) -> Tensor:
     return torch.where(inside, difference, torch.full_like(difference, torch.inf))
 
 
-def _window_mean(maps: Tensor, reach: int) -> Tensor:
-    """Mean of maps ``(N, H, W)`` over the part of a window of this half width that lies inside the image."""
+def window_mean(maps: Tensor, reach: int) -> Tensor:
+    """Mean of maps ``(..., C, H, W)`` over what of a window of this half width lies inside the image."""
     for window in ((2 * reach + 1, 1), (1, 2 * reach + 1)):
         padding = (window[0] // 2, window[1] // 2)
         maps = F.avg_pool2d(maps, window, 1, padding, count_include_pad=False)
@@ -165,7 +165,7 @@ def candidates(volume: CostVolume, views: Sequence[AlignedView]) -> Candidates:
             features = torch.stack([torch.ones_like(margin), (margin + 0.03).log(), cost, differs])
             yield ViewEvidence(features, difference)
 
-    contrast, sharpness = _window_mean(torch.stack([found.gain, found.sharpness]), CONTRAST_REACH)
+    contrast, sharpness = window_mean(torch.stack([found.gain, found.sharpness]), CONTRAST_REACH)
     inverse_depth = volume.inverse_depth[0] + position * volume.plane_step
     return Candidates(inverse_depth, contrast, sharpness, evidence())
 
@@ -199,7 +199,7 @@ def _match_by_kernels(volume: CostVolume) -> Matches:
 
     buffers = Buffers()
     found = _left_winner(volume, buffers)
-    means = _window_mean(torch.stack([found.gain, found.sharpness]), CONTRAST_REACH)
+    means = window_mean(torch.stack([found.gain, found.sharpness]), CONTRAST_REACH)
     others = [_right_winners(volume, view, buffers) for view in volume.aligned]
     confidence, deviation, inverse_depth = kernels.weighed(volume, found, means, others)[:, None]
     return Matches(inverse_depth, confidence, to_device_of(confidence, volume.plane_step), deviation)
@@ -246,4 +246,4 @@ def _mean_precision(matches: Matches, least_deviation: float) -> Tensor:
         return torch.ones_like(matches.confidence)
     precision = matches.deviation.clamp_min(least_deviation) ** -2 * matches.confidence.clamp_min(1.0)
     precision = torch.where(matches.confidence > 0, precision, torch.zeros_like(precision))
-    return _window_mean(precision[:, 0], KNOWN_REACH)[:, None] / ENOUGH_KNOWN
+    return window_mean(precision, KNOWN_REACH) / ENOUGH_KNOWN

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -10,24 +11,18 @@ from torch import Tensor
 
 from geodiff_plugin._kernels import launch_bound, use_kernel
 from geodiff_plugin._strips import STRIP_PIXELS, row_strips
+from geodiff_plugin.algorithm.correction import log_depth_at
 from geodiff_plugin.algorithm.terms import match_exposure
 from geodiff_plugin.geometry import as_fine_as, image_size, warp_right_to_left
+from geodiff_plugin.matching import Matches, window_mean
 from geodiff_plugin.types import CameraView
 
 #: Confidence is the probability of a relative error below this.
 RIGHT_WITHIN = 0.1
 #: Log-odds, by logistic regression on pairs with truth, every pair weighing the same
-#: (``python -m tests.benchmarks.confidence`` refits them): constant, certainty, strength of the prior,
-#: photometric agreement, and relative spread of the ensemble (by hand: 10 % quarter the odds).
-BY_EVIDENCE = (-0.228, 0.788, 2.42, 0.0864, -15.0)
-#: Below this photometric error images agree as well as their noise lets them.
-LEAST_DIFFERENCE = 0.01
-#: Above this photometric error they do not agree at all.
-MOST_DIFFERENCE = 0.1
-#: A smaller error of the prior, in log depth, makes no difference.
-STRONG = 0.03
-#: Nor does a larger one.
-WEAK = 0.15
+#: (``python -m tests.benchmarks.confidence`` refits them): constant, certainty, closeness of the matches,
+#: steadiness, and relative spread of the ensemble (by hand: 10 % quarter the odds).
+BY_EVIDENCE = (-1.9, 0.36, 1.04, 0.94, -15.0)
 #: A smaller error that is left in a depth makes no difference.
 LEAST_LEFT = 0.0005
 #: Nor does a larger one.
@@ -36,6 +31,19 @@ MOST_LEFT = 0.05
 BEST = 0.01
 #: The error of a useless prior.
 USELESS = 0.5
+#: Half width in px of the window, on the grid of the matches, over which both of the following are means.
+GROUNDS_REACH = 15
+#: Matches that are closer to a depth, in planes, make no difference.
+CLOSE = 0.5
+#: Nor do those that are farther from it.
+FAR = 10.0
+#: Mean confidence of a window that matches as far as that are given beside the found ones: a few may be close
+#: by chance, and where there are none, none is close.
+FEW = 0.02
+#: A smaller change of log depth makes no difference.
+STEADY = 0.005
+#: Nor does a larger one.
+MOVED = 0.2
 #: Known share of the matches around a pixel from which on they determine what their support says.
 DETERMINED_FROM = 0.33
 #: Support at which the prior's error is half known: it is measured where there are matches, and a prior that
@@ -49,53 +57,84 @@ def determined(known: Tensor, size: tuple[int, int]) -> Tensor:
     return F.interpolate(share, size, mode="bilinear", align_corners=False)
 
 
-def depth_evidence(
-    support: Tensor, error: Tensor, visible: Tensor, spread: Tensor | None, prior_error: Tensor | None = None
-) -> Tensor:
+class Grounds(NamedTuple):
+    """What the depth of an image rests on, ``(1, 1, H, W)`` each."""
+
+    support: Tensor  # of ``fit_depth``, [0, 1]
+    apart: Tensor  # mean distance of the matches around a pixel from its depth, in planes
+    moved: Tensor  # mean change of log depth around it since the denoising; the fewer matches, the larger
+
+
+def grounds_of(denoised_m: Tensor, depth_m: Tensor, target: Matches, support: Tensor) -> Grounds:
+    """What a depth rests on: its support, how near the matches are to it, how little it was corrected.
+
+    Support says how much the matches of a place weigh, not whether they agree. Where they scatter around the
+    depth, or the last fit had to change the denoised map, the depth is often wrong.
+
+    Args:
+        denoised_m: ``(1, 1, H, W)`` metres, the map before it was fitted to the matches for the last time.
+        depth_m: as ``denoised_m``, the result.
+        target: the matches and points, on any grid.
+        support: ``(1, 1, H, W)`` in [0, 1], of ``fit_depth``.
+    """
+    log_depth, denoised = (log_depth_at(each_m, target.size) for each_m in (depth_m, denoised_m))
+    planes = (target.inverse_depth - torch.exp(-log_depth)) / target.plane_step.view(-1, 1, 1, 1)
+    weighted = target.confidence * planes.abs().clamp_max(FAR)
+    layers = torch.cat([target.confidence, weighted, (log_depth - denoised).abs()], 1)
+    weight, weighted, moved = window_mean(layers, GROUNDS_REACH).split(1, 1)
+    apart = (weighted + FEW * FAR) / (weight + FEW)
+    # A map that hardly any match could correct is not steady.
+    known = target.confidence.clamp_max(1.0).mean((2, 3), keepdim=True)
+    share = known / (known + FEW)
+    moved = moved.clamp(STEADY, MOVED) ** share * MOVED ** (1.0 - share)
+    both = F.interpolate(torch.cat([apart, moved], 1), image_size(support), mode="bilinear")
+    return Grounds(support, *both.split(1, 1))
+
+
+def depth_evidence(grounds: Grounds, spread: Tensor | None, prior_error: Tensor | None = None) -> Tensor:
     """Features ``(B, 5, H, W)`` of the logistic model in ``depth_confidence``, whose arguments these are.
 
-    They are 1, certainty, strength, agreement and spread. With less support, a pixel's prior error e moves
+    They are 1, certainty, closeness, steadiness and spread. With less support, a pixel's prior error e moves
     from the measured one towards a useless prior's. Certainty is the log of .05 over the remaining error,
-    ``(1 - support) * e``; strength is the log of .15 over e, because wrong matches lose their weight with a
-    good prior, while a poor one follows them. Agreement is the log of .1 over the photometric ``error``.
+    ``(1 - support) * e``, closeness that of 10 planes over the distance of the matches, and steadiness that
+    of .2 over the correction.
     """
-    agreement = -(error.clamp(LEAST_DIFFERENCE, MOST_DIFFERENCE) / MOST_DIFFERENCE).log()
+    support, apart, moved = grounds
     measured = support.new_tensor(USELESS) if prior_error is None else prior_error.clamp(BEST, USELESS)
     share = support / (support + HALF_KNOWN)
-    left_to_prior = measured**share * USELESS ** (1.0 - share)
-    left = (1.0 - support) * left_to_prior
+    left = (1.0 - support) * measured**share * USELESS ** (1.0 - share)
     evidence = [
         torch.ones_like(support),
         -(left.clamp(LEAST_LEFT, MOST_LEFT) / MOST_LEFT).log(),
-        -(left_to_prior.clamp(STRONG, WEAK) / WEAK).log(),
-        torch.where(visible, agreement, torch.zeros_like(agreement)),
+        -(apart.clamp(CLOSE, FAR) / FAR).log(),
+        -(moved.clamp(STEADY, MOVED) / MOVED).log(),
         torch.zeros_like(support) if spread is None else spread,
     ]
     return torch.cat(evidence, dim=1)
 
 
-def depth_confidence(
-    support: Tensor, error: Tensor, visible: Tensor, spread: Tensor | None, prior_error: Tensor | None = None
-) -> Tensor:
+def depth_confidence(grounds: Grounds, spread: Tensor | None, prior_error: Tensor | None = None) -> Tensor:
     """Probability ``(B, 1, H, W)`` that a depth is within 10 % of the truth.
 
-    From the support of ``fit_depth``, the photometric error, the relative spread of an ensemble's members
-    (or ``None``), and the prior's ``local_error`` on any grid (``None`` counts as a useless prior).
+    From what it rests on, the relative spread of an ensemble's members (or ``None``), and the prior's
+    ``local_error`` on any grid (``None`` counts as a useless prior).
     """
+    support = grounds.support
     size = image_size(support)
     if prior_error is not None and image_size(prior_error) != (1, 1):
         prior_error = F.interpolate(prior_error, size, mode="nearest-exact")
     if use_kernel(support):
         from geodiff_plugin.result import kernels
 
-        return kernels.confidence_of(support, error, visible, spread, prior_error)
+        return kernels.confidence_of(grounds, spread, prior_error)
     weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
     confidence = torch.empty_like(support)
     for rows in row_strips(*size):  # the features take five times as much memory as the result
-        shown = [x[:, :, rows] for x in (support, error, visible)]
+        part = Grounds(*(x[:, :, rows] for x in grounds))
         further = (None if x is None else x.expand_as(support)[:, :, rows] for x in (spread, prior_error))
-        evidence = depth_evidence(*shown, *further)
-        confidence[:, :, rows] = torch.sigmoid((weights * evidence).sum(1, keepdim=True))
+        confidence[:, :, rows] = torch.sigmoid(
+            (weights * depth_evidence(part, *further)).sum(1, keepdim=True)
+        )
     return confidence
 
 

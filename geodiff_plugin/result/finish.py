@@ -22,7 +22,13 @@ from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.geometry import image_size, resize_intrinsics
 from geodiff_plugin.matching import Matches, build_cost_volume, known_share, match_volume
 from geodiff_plugin.messages import Message
-from geodiff_plugin.result.confidence import depth_confidence, determined, reprojection
+from geodiff_plugin.result.confidence import (
+    Grounds,
+    depth_confidence,
+    determined,
+    grounds_of,
+    reprojection,
+)
 from geodiff_plugin.result.ensemble import ensemble_metric, median, spread_around
 from geodiff_plugin.result.flattening import flatten
 from geodiff_plugin.result.indicators import indicators_of, measure_indicators, read_numbers
@@ -78,6 +84,7 @@ class Refined(NamedTuple):
 
     depth_m: Tensor
     support: Tensor
+    grounds: Grounds  # of its confidence
 
 
 def finish(
@@ -111,9 +118,8 @@ def finish(
     visible, error = reprojection(native.views, depth_m, left_01, K) if native.views else (None, None)
     prior_error, confidence = _error_of(members), None
     if refined is not None:
-        seen = (error, visible) if error is not None and visible is not None else _unseen(depth_m)
         spread = None if uncertainty is None else uncertainty / depth_m
-        confidence = depth_confidence(refined.support, *seen, spread, prior_error)
+        confidence = depth_confidence(refined.grounds, spread, prior_error)
     relative = median(torch.cat([member.relative for member in members]), 0)[None]
     measured = _Measured(depth_m, relative, confidence, _over_prior(members, depth_m), visible)
     numbers = read_numbers(_numbers(evidence, members, measured, options))
@@ -147,11 +153,6 @@ def _share_kept(
     native, misfit = evidence.native, misfit_of(found, evidence.native.size)
     share = points_agreement(found) * (depth_m < _farthest_m(evidence, config))
     return share if misfit == NO_MISFIT else share * share_left(depth_m, K, native.views, misfit)
-
-
-def _unseen(depth_m: Tensor) -> tuple[Tensor, Tensor]:
-    """Photometric error and visibility of a map without a right view."""
-    return torch.zeros_like(depth_m), torch.zeros_like(depth_m, dtype=torch.bool)
 
 
 def _resized(x: Tensor, size: tuple[int, int], antialias: bool = True) -> Tensor:
@@ -203,12 +204,13 @@ def refine(
     if matches is None and points is None:
         return None
     weight, error = _mean(members, "reflection_weight"), _error_of(members)
-    spacing = max(image_size(depth_m)) / max(image_size(members[0].relative))
+    spacing, denoised_m = max(image_size(depth_m)) / max(image_size(members[0].relative)), depth_m
     depth_m = sharpen_edges(depth_m, left_01, max(1, round(spacing)))
     target = correction_target(matches, points, weight, error, depth_m)
     if target is None or error is None:
         return None
-    fitted_m, support, _ = fit_depth(depth_m, target, evidence.native.left_01[None], error, config)
+    fitted_m, of_fit, _ = fit_depth(depth_m, target, evidence.native.left_01[None], error, config)
+    support = of_fit
     if matches is not None:
         measured = error.amin((2, 3), keepdim=True)  # its value where the prior gives a depth
         target = correction_target(matches, points, weight, error, fitted_m)
@@ -216,8 +218,8 @@ def refine(
         known = known_share(target)
         fitted_m = vote_depth(fitted_m, evidence, target, known, measured, spacing)
         fitted_m = flatten(fitted_m, target, left_01, measured)
-        support = support * determined(known, image_size(support))
-    return Refined(fitted_m, support)
+        support = of_fit * determined(known, image_size(of_fit))
+    return Refined(fitted_m, support, grounds_of(denoised_m, fitted_m, target, of_fit))
 
 
 def _member_at(size: tuple[int, int], member: Member, like: Tensor, options: ResultOptions) -> Tensor:

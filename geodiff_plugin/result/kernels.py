@@ -35,11 +35,11 @@ _MEDIAN = tl.constexpr(voting.MEDIAN)
 _IN_MEDIAN = tl.constexpr(voting.MEDIAN**2)
 _EDGE_PX = tl.constexpr(EDGE_PX)
 _NEAREST_M = tl.constexpr(NEAREST_M)
-_CONSTANT, _CERTAINTY, _STRENGTH, _AGREEMENT, _SPREAD_COUNTS = map(tl.constexpr, confidence.BY_EVIDENCE)
-_LEAST_DIFFERENCE = tl.constexpr(confidence.LEAST_DIFFERENCE)
-_MOST_DIFFERENCE = tl.constexpr(confidence.MOST_DIFFERENCE)
-_STRONG = tl.constexpr(confidence.STRONG)
-_WEAK = tl.constexpr(confidence.WEAK)
+_CONSTANT, _CERTAINTY, _CLOSENESS, _STEADINESS, _SPREAD_COUNTS = map(tl.constexpr, confidence.BY_EVIDENCE)
+_CLOSE = tl.constexpr(confidence.CLOSE)
+_FAR = tl.constexpr(confidence.FAR)
+_STEADY = tl.constexpr(confidence.STEADY)
+_MOVED = tl.constexpr(confidence.MOVED)
 _LEAST_LEFT = tl.constexpr(confidence.LEAST_LEFT)
 _MOST_LEFT = tl.constexpr(confidence.MOST_LEFT)
 _BEST = tl.constexpr(confidence.BEST)
@@ -156,7 +156,7 @@ def _in_units(value, least, most):
 
 @triton.jit
 def confidence_kernel(
-    support, error, visible, spread, prior_error, confident, pixels,
+    support, apart, moved, spread, prior_error, confident, pixels,
     SPREAD: tl.constexpr, PRIOR: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip
     """``confidence.depth_confidence``. Grid: blocks of pixels, maps.
@@ -176,25 +176,22 @@ def confidence_kernel(
         measured = tl.load(prior_error + where_measured, exists, 1.0)
         log_measured = tl.log(tl.minimum(tl.maximum(measured, _BEST), _USELESS))
     share = supported / (supported + _HALF_KNOWN)
-    left_to_prior = tl.exp(share * log_measured + (1.0 - share) * log_useless)
-    odds = _in_units((1.0 - supported) * left_to_prior, _LEAST_LEFT, _MOST_LEFT) * _CERTAINTY + _CONSTANT
-    odds += _in_units(left_to_prior, _STRONG, _WEAK) * _STRENGTH
-    agreement = _in_units(tl.load(error + at, exists, 1.0), _LEAST_DIFFERENCE, _MOST_DIFFERENCE)
-    odds += tl.where(tl.load(visible + at, exists, 0) != 0, agreement * _AGREEMENT, 0.0)
+    left = (1.0 - supported) * tl.exp(share * log_measured + (1.0 - share) * log_useless)
+    odds = _in_units(left, _LEAST_LEFT, _MOST_LEFT) * _CERTAINTY + _CONSTANT
+    odds += _in_units(tl.load(apart + at, exists, 1.0), _CLOSE, _FAR) * _CLOSENESS
+    odds += _in_units(tl.load(moved + at, exists, 1.0), _STEADY, _MOVED) * _STEADINESS
     if SPREAD:
         odds += tl.load(spread + at, exists, 0.0) * _SPREAD_COUNTS
     tl.store(confident + at, 1.0 / (1.0 + tl.exp(-odds)), exists)
 
 
-def confidence_of(
-    support: Tensor, error: Tensor, visible: Tensor, spread: Tensor | None, prior_error: Tensor | None
-) -> Tensor:
+def confidence_of(grounds: confidence.Grounds, spread: Tensor | None, prior_error: Tensor | None) -> Tensor:
     """``confidence.depth_confidence``; ``prior_error`` is a number a map, or has the size of the maps."""
-    maps = [each.contiguous() for each in (support, error, visible)]
-    pixels, confident = support[0].numel(), torch.empty_like(maps[0])
+    maps = [each.contiguous() for each in grounds]
+    pixels, confident = maps[0][0].numel(), torch.empty_like(maps[0])
     further = [maps[0] if each is None else each.float().contiguous() for each in (spread, prior_error)]
     prior = 0 if prior_error is None else 1 if prior_error[0].numel() == 1 else 2
-    launched_on(support, confidence_kernel[(triton.cdiv(pixels, PIXELS), len(support))])(
+    launched_on(maps[0], confidence_kernel[(triton.cdiv(pixels, PIXELS), len(maps[0]))])(
         *maps, *further, confident, pixels, SPREAD=spread is not None, PRIOR=prior, PIXELS=PIXELS
     )
     return confident

@@ -1,15 +1,19 @@
 """Refits what the confidence promises, on pairs with truth: coefficients to paste, and how they do elsewhere.
 
-Beside it: what is said of pixels by the texture around them.
+Beside it: what is said of pixels by the texture around them, and of walls where their depth is off.
 
 python -m tests.benchmarks.confidence --data DIR --strengths exact,5%,20%
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -21,9 +25,12 @@ from rich.table import Table
 from scipy.ndimage import uniform_filter
 from scipy.optimize import minimize
 from scipy.special import expit
+from scipy.stats import rankdata
+from torch import Tensor
 from tqdm import tqdm
 
 from geodiff_plugin._checks import bad_value, check_choice
+from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.evaluation.baselines import PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.guided import call_arguments, posed_views
 from geodiff_plugin.evaluation.baselines.unguided import sweep
@@ -32,21 +39,29 @@ from geodiff_plugin.evaluation.datasets.sample import StereoSample
 from geodiff_plugin.evaluation.experiment import DENSE
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.matching import consistency
-from geodiff_plugin.result import confidence
+from geodiff_plugin.result import confidence, finish
+from geodiff_plugin.result.readings import read_pixel
 from tests.lab.options import STRENGTHS
 from tests.lab.strength import EmulatedPrior
+from tests.lab.surfaces import PLANES, guided_stages, marked_planes, of_polygon, plane_of
 
 __all__ = [
     "Decile",
-    "OfTexture",
     "Observed",
+    "OfTexture",
+    "OnWalls",
+    "Wall",
     "by_texture",
     "calibrate",
     "deciles",
     "fit_log_odds",
+    "observe_capture",
     "observe_depth",
     "observe_emulated",
     "observe_matches",
+    "observe_planes",
+    "of_walls",
+    "off_plane",
     "promised",
     "texture_of",
 ]
@@ -123,6 +138,16 @@ TEXTURE_REACH = consistency.CONTRAST_REACH
 TEXTURES = (0.005, 0.01, 0.02, 0.04)
 #: Confidence from which on a pixel is said to be right.
 SURE = 0.9
+#: Relative error above which the depth of a wall is off.
+OFF = 0.05
+#: Texture below which a wall is plain.
+PLAIN = TEXTURES[2]
+#: Distance of the inverse depth of a wall from the best plane of a window, root mean square over its mean.
+FLAT = 0.005
+#: Known share of such a window from which on there is a plane.
+LEAST_KNOWN = 0.3
+#: Frames of a capture that are looked at, each with its best neighbour.
+FRAMES = 6
 
 
 class Observed(NamedTuple):
@@ -132,6 +157,15 @@ class Observed(NamedTuple):
     right: np.ndarray  # (N,) bool
     stated: np.ndarray | None = None  # (N,) the confidence of the output
     texture: np.ndarray | None = None  # (N,) ``texture_of`` the left image
+    error: np.ndarray | None = None  # (N,) relative error of the depth, >= 0
+    wall: np.ndarray | None = None  # (N,) 1 on plain walls, else 0
+
+
+class Wall(NamedTuple):
+    """Pixels of the plain walls of one pair."""
+
+    error: np.ndarray  # (N,) relative error of the depth, >= 0
+    stated: np.ndarray  # (N,) the confidence of the output
 
 
 def texture_of(image: np.ndarray) -> np.ndarray:
@@ -147,12 +181,68 @@ def texture_of(image: np.ndarray) -> np.ndarray:
     return uniform_filter(steps, 2 * TEXTURE_REACH + 1, mode="nearest")
 
 
-def _drawn(evidence: np.ndarray, right: np.ndarray, where: np.ndarray, seed: int) -> Observed:
-    """At most ``PIXELS`` of the pixels ``where (H, W)``, at random; ``evidence`` is ``(F, H, W)``."""
+def off_plane(depth_m: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """``(H, W)`` distance of inverse depth from its best plane around a pixel, RMS over the mean.
+
+    Infinite where the truth is unknown in most of the window, of half width ``TEXTURE_REACH``.
+    """
+    row, column = np.mgrid[: depth_m.shape[0], : depth_m.shape[1]] / max(depth_m.shape)
+    inverse = np.where(valid, 1.0 / np.where(valid, depth_m, 1.0), 0.0)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return uniform_filter(values * valid, 2 * TEXTURE_REACH + 1, mode="constant")
+
+    known = mean(np.ones(depth_m.shape))
+    share = np.maximum(known, 1e-9)
+    y, x, q = (mean(values) / share for values in (row, column, inverse))
+    yy, xx, yx = (
+        mean(row * row) / share - y * y,
+        mean(column**2) / share - x * x,
+        mean(row * column) / share - y * x,
+    )
+    yq, xq, qq = (
+        mean(one * inverse) / share - other * q for one, other in ((row, y), (column, x), (inverse, q))
+    )
+    determinant = np.maximum(yy * xx - yx**2, 1e-14)
+    down, across = (xx * yq - yx * xq) / determinant, (yy * xq - yx * yq) / determinant
+    rest = np.sqrt(np.maximum(qq - down * yq - across * xq, 0.0)) / np.maximum(q, 1e-9)
+    return np.where(known >= LEAST_KNOWN, rest, np.inf)
+
+
+def _drawn(layers: np.ndarray, where: np.ndarray, seed: int) -> np.ndarray:
+    """``(F, N)`` of ``layers (F, H, W)`` at random pixels of ``where (H, W)``, ``PIXELS`` at most."""
     at = np.flatnonzero(where)
     if len(at) > PIXELS:
         at = np.random.default_rng(seed).choice(at, PIXELS, replace=False)
-    return Observed(evidence.reshape(len(evidence), -1)[:, at].T.astype(np.float64), right.ravel()[at])
+    return layers.reshape(len(layers), -1)[:, at].astype(np.float64)
+
+
+@contextmanager
+def _recorded() -> Iterator[list[Tensor]]:
+    """The evidence ``(1, F, H, W)`` of every confidence that is made within."""
+    found, made = [], finish.depth_confidence
+
+    def recording(*arguments: Any) -> Tensor:
+        found.append(confidence.depth_evidence(*arguments))
+        return made(*arguments)
+
+    with patch.object(finish, "depth_confidence", recording):
+        yield found
+
+
+def _observe(
+    call: Callable[[], Any], left: np.ndarray, depth_m: np.ndarray, valid: np.ndarray, seed: int
+) -> Observed:
+    """What a guided call shows on an image ``(H, W, 3)`` uint8 whose truth is known where ``valid``."""
+    with _recorded() as evidence:
+        out = call()
+    found_m, stated = (np.asarray(values).squeeze() for values in (out.prediction, out.confidence))
+    error = np.abs(found_m / np.where(valid, depth_m, 1.0) - 1.0)
+    texture = texture_of(left)
+    wall = (texture < PLAIN) & (off_plane(depth_m, valid) < FLAT)
+    layers = np.concatenate([np.stack([stated, texture, error, wall]), evidence[0][0].cpu().numpy()])
+    (stated, texture, error, wall), drawn = np.split(_drawn(layers, valid, seed), [4])
+    return Observed(drawn.T, error < confidence.RIGHT_WITHIN, stated, texture, error, wall)
 
 
 def observe_depth(sample: StereoSample, settings: Settings, priors: PriorCache) -> Observed:
@@ -164,23 +254,37 @@ def observe_depth(sample: StereoSample, settings: Settings, priors: PriorCache) 
         priors: where the prior is kept.
     """
     guidance = GeometryGuidance(*posed_views(sample, settings.views))
-    out = priors.get(settings)(
-        Image.fromarray(sample.left),
-        guidance=guidance,
-        output_uncertainty=settings.ensemble > 1,
-        output_type="pt",
-        **call_arguments(settings),
-    )
-    spread = None if out.uncertainty is None else out.uncertainty / out.prediction
-    known = None if out.prior_error is None else out.prior_error.view(-1, 1, 1, 1).to(out.support)
-    maps = out.support, out.photometric_error, out.visible
-    evidence = confidence.depth_evidence(*maps, spread, known)[0]
-    depth_m = out.prediction[0, 0].cpu().numpy()
-    right = np.abs(depth_m / np.where(sample.valid, sample.depth_m, 1.0) - 1.0) < confidence.RIGHT_WITHIN
-    shown = np.stack([out.confidence[0, 0].cpu().numpy(), texture_of(sample.left)])
-    both = np.concatenate([evidence.cpu().numpy(), shown])
-    drawn = _drawn(both, right, sample.valid, settings.seed)
-    return Observed(drawn.evidence[:, :-2], drawn.right, drawn.evidence[:, -2], drawn.evidence[:, -1])
+
+    def call() -> Any:
+        return priors.get(settings)(
+            Image.fromarray(sample.left),
+            guidance=guidance,
+            output_uncertainty=settings.ensemble > 1,
+            **call_arguments(settings),
+        )
+
+    return _observe(call, sample.left, sample.depth_m, sample.valid, settings.seed)
+
+
+def observe_capture(root: Path, settings: Settings, priors: PriorCache) -> Iterator[Observed]:
+    """As ``observe_depth``, of some frames of a capture, each with its best neighbour, poses as given."""
+    capture = Capture.open(root)
+    capture.solve("given")
+    for i in ((np.arange(FRAMES) + 0.5) * len(capture) / FRAMES).astype(int):
+        name = capture.names[i]
+        left = np.rint(255.0 * capture.image(name)).astype(np.uint8)
+        call = partial(capture.depth, priors.get(settings), name, 1, seed=settings.seed)
+        yield _observe(call, left, *capture.measured_depth(name), settings.seed)
+
+
+def observe_planes(root: Path, settings: Settings, priors: PriorCache) -> Iterator[Wall]:
+    """Marked planes of pairs without truth; the error is the distance from the best plane of the result."""
+    for _, images, rig, planes in marked_planes(root):
+        stages = guided_stages(priors.get(settings), images, rig, settings.seed)
+        depth_m, stated = stages.of("result"), stages.of("confidence")
+        inside = [of_polygon(polygon, depth_m.shape) for polygon in planes.values()]
+        error = [np.abs(plane_of(depth_m, each) * depth_m[each] - 1.0) for each in inside]
+        yield Wall(np.concatenate(error), np.concatenate([stated[each] for each in inside]))
 
 
 def observe_emulated(sample: StereoSample, strengths: Sequence[str]) -> list[Observed]:
@@ -219,7 +323,9 @@ def observe_matches(sample: StereoSample, settings: Settings, priors: PriorCache
     known = (agreed & textured).cpu().numpy() & (truth_m > 0)
     error = np.abs(inverse_depth.cpu().numpy() - 1.0 / np.where(truth_m > 0, truth_m, 1.0))
     right = error <= 3.0 * float(volume.plane_step)
-    return _drawn(view.features.cpu().numpy(), right, known, settings.seed)
+    layers = np.concatenate([right[None], view.features.cpu().numpy()])
+    drawn = _drawn(layers, known, settings.seed)
+    return Observed(drawn[1:].T, drawn[0] > 0)
 
 
 def _stack(pairs: Sequence[Observed]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -321,6 +427,67 @@ def _print_textures(console: Console, title: str, pairs: Sequence[Observed]) -> 
     console.print(table)
 
 
+class OnWalls(NamedTuple):
+    """What is said of plain walls, of the pixels that are off by more than ``OFF`` and of those that are not.
+
+    Every pair weighs the same.
+    """
+
+    off: float  # share that is off
+    within: float  # of these, share within ``confidence.RIGHT_WITHIN``
+    of_off: float  # their mean confidence
+    of_right: float  # that of the others
+    spread_off: float  # median standard error by confidence of those that are off, as a share of the depth
+    spread_right: float  # that of the others
+    told_apart: float  # probability that of one of each, the one that is right has the higher confidence
+
+
+def of_walls(walls: Sequence[Wall]) -> OnWalls:
+    """One row of the table of walls; NaN where none, or all, of their pixels are off."""
+    error, stated = (np.concatenate([getattr(wall, name) for wall in walls]) for name in Wall._fields)
+    weights = np.concatenate([np.full(len(wall.error), 1.0 / max(len(wall.error), 1)) for wall in walls])
+    off = error > OFF
+    if off.all() or not off.any():
+        return OnWalls(float(off.mean()), *[float("nan")] * 6)
+    within = np.average(error[off] < confidence.RIGHT_WITHIN, weights=weights[off])
+    said = [float(np.average(stated[own], weights=weights[own])) for own in (off, ~off)]
+    spread = [standard_error(float(np.median(stated[own]))) for own in (off, ~off)]
+    right = rankdata(stated)[~off]
+    pairs = len(right) * off.sum()
+    apart = (right.sum() - len(right) * (len(right) + 1) / 2.0) / pairs
+    return OnWalls(float(np.average(off, weights=weights)), float(within), *said, *spread, float(apart))
+
+
+def standard_error(stated: float) -> float:
+    """What a reading says of a depth of this confidence: its standard deviation as a share of it."""
+    spread = read_pixel(np.ones((1, 1)), np.eye(3), (0, 0), np.full((1, 1), stated)).spread
+    assert spread is not None  # confidence tells
+    return spread
+
+
+def _print_walls(console: Console, walls: Mapping[str, Sequence[Wall]]) -> None:
+    """The table of ``of_walls``: a row for each data."""
+    table = Table(
+        "data", "off", "of these within", "confidence: off", "right", "+-: off", "right", "told apart"
+    )
+    for root, own in walls.items():
+        if sum(len(wall.error) for wall in own):
+            table.add_row(root, *(f"{value:.3f}" for value in of_walls(own)))
+    console.print(
+        f"plain walls: pixels off by more than {OFF:.0%}, how many of these are within "
+        f"{confidence.RIGHT_WITHIN:.0%}, and what is said of them and of the others",
+        highlight=False,
+    )
+    console.print(table)
+
+
+def wall_of(pair: Observed) -> Wall:
+    """The walls of a pair with truth."""
+    assert pair.wall is not None and pair.error is not None and pair.stated is not None  # of depth
+    on_wall = pair.wall > 0
+    return Wall(pair.error[on_wall], pair.stated[on_wall])
+
+
 def _print_all_textures(console: Console, observed: Mapping[str, Sequence[Observed]]) -> None:
     """The table of each data and of all."""
     for root, own in observed.items():
@@ -356,7 +523,9 @@ def _print(
 
 
 def main(
-    data: Annotated[list[str], typer.Option(help="Folder with data sets, or synthetic:N; repeat it.")],
+    data: Annotated[
+        list[str], typer.Option(help="Folder with data sets, a capture, or synthetic:N; repeat it.")
+    ],
     prior: Annotated[list[str] | None, typer.Option(help="Priors to guide; repeat it for several.")] = None,
     ensemble: Annotated[int, typer.Option(help="Members; 2 and more also fit the effect of spread.")] = 1,
     resolution: Annotated[int | None, typer.Option(help="Longer side for the prior, pixels.")] = None,
@@ -371,38 +540,65 @@ def main(
     emulated = [name.strip() for name in strengths.split(",") if name.strip()]
     for name in emulated:
         check_choice(name, "strengths", STRENGTHS)
-    refs = [(root, ref) for root in data for ref in find_pairs(root)]
-    console, priors = Console(width=100), PriorCache()
-    kinds: dict[str, tuple[Callable[..., Observed], tuple[Any, ...]]] = {
-        "matches": (
-            observe_matches,
-            ("matching/consistency.py", "LOG_ODDS", MATCH_SIGNS, consistency.LOG_ODDS),
-        ),
-        "depth": (observe_depth, ("result/confidence.py", "BY_EVIDENCE", SIGNS, confidence.BY_EVIDENCE)),
-    }
+    console, priors = Console(width=120), PriorCache()
     settings = [
         Settings(prior=one, ensemble=ensemble, resolution=resolution, device=device)
         for one in prior or ["bundled"]
     ]
-    for kind, (observe, (where, name, signs, shipped)) in kinds.items():
-        if what not in (kind, "both"):
-            continue
-        each = settings if kind == "depth" else settings[:1]
-        observed: dict[str, list[Observed]] = {}
-        for root, ref in tqdm(refs, desc=kind):  # what one pair shows under several priors stays in one half
-            sample = load(ref)
-            own = [observe(sample, one, priors) for one in each]
-            if kind == "depth" and emulated:
-                own += observe_emulated(sample, emulated)
-            pair = _joined(own)
-            if len(pair.right):
-                observed.setdefault(root, []).append(pair)
-        count = sum(map(len, observed.values()))
-        if count < 2:  # each half is judged by the other
-            bad_value("data", "folders with at least two pairs with truth", f"{count} in {', '.join(data)}")
-        _print(console, kind, where, name, observed, signs, shipped)
-        if kind == "depth":
-            _print_all_textures(console, observed)
+    if what in ("matches", "both"):
+        observed = _observed_pairs(data, lambda sample: [observe_matches(sample, settings[0], priors)])
+        _check_count(observed)
+        where = "matching/consistency.py", "LOG_ODDS"
+        _print(console, "matches", *where, observed, MATCH_SIGNS, consistency.LOG_ODDS)
+    if what in ("depth", "both"):
+        _depth(console, data, settings, emulated, priors)
+
+
+def _observed_pairs(
+    data: Sequence[str], observe: Callable[[StereoSample], list[Observed]]
+) -> dict[str, list[Observed]]:
+    """Pairs with truth by their data; what one shows under several priors stays in one half."""
+    observed: dict[str, list[Observed]] = {}
+    for root, ref in tqdm([(one, ref) for one in data for ref in find_pairs(one)]):
+        pair = _joined(observe(load(ref)))
+        if len(pair.right):
+            observed.setdefault(root, []).append(pair)
+    return observed
+
+
+def _check_count(observed: Mapping[str, Sequence[Observed]]) -> None:
+    """Each half is judged by the other: there must be two."""
+    count = sum(map(len, observed.values()))
+    if count < 2:
+        bad_value("data", "folders with at least two pairs with truth", f"{count} in {', '.join(observed)}")
+
+
+def _depth(
+    console: Console,
+    data: Sequence[str],
+    settings: Sequence[Settings],
+    emulated: Sequence[str],
+    priors: PriorCache,
+) -> None:
+    """Constants of the confidence of depth, and what it says by texture and of walls."""
+    marked = [root for root in data if (Path(root) / PLANES).is_file()]
+    captures = [root for root in data if (Path(root) / "transforms.json").is_file()]
+    with_truth = [root for root in data if root not in (*marked, *captures)]
+    observed = _observed_pairs(
+        with_truth,
+        lambda sample: [
+            *(observe_depth(sample, one, priors) for one in settings),
+            *(observe_emulated(sample, emulated) if emulated else ()),
+        ],
+    )
+    observed |= {root: list(observe_capture(Path(root), settings[0], priors)) for root in captures}
+    _check_count(observed)
+    where = "result/confidence.py", "BY_EVIDENCE"
+    _print(console, "depth", *where, observed, SIGNS, confidence.BY_EVIDENCE)
+    _print_all_textures(console, observed)
+    walls = {root: list(map(wall_of, own)) for root, own in observed.items()}
+    walls |= {root: list(observe_planes(Path(root), settings[0], priors)) for root in marked}
+    _print_walls(console, walls)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,12 +13,15 @@ from geodiff_plugin.evaluation.datasets import find_pairs, load
 from tests.benchmarks.confidence import (
     TEXTURES,
     Observed,
+    Wall,
     by_texture,
     calibrate,
     deciles,
     fit_log_odds,
     main,
     observe_emulated,
+    of_walls,
+    off_plane,
     promised,
     texture_of,
 )
@@ -88,6 +92,34 @@ def test_classes_of_texture_are_counted_apart():
     np.testing.assert_allclose(rows[-1], (4 / 6, 0.75, 0.5, 0.25, 1.0))
 
 
+def test_walls_that_are_off_are_counted_apart():
+    """Of four pixels one is off by 6 %, of two of a second pair one by 20 %; every pair weighs the same."""
+    one = Wall(np.array([0.0, 0.01, 0.06, 0.04]), np.array([0.9, 0.8, 0.5, 0.4]))
+    other = Wall(np.array([0.2, 0.0]), np.array([0.3, 0.6]))
+    row = of_walls([one, other])
+    np.testing.assert_allclose(row.off, (1 / 4 + 1 / 2) / 2)
+    np.testing.assert_allclose(row.within, (1 / 4) / (1 / 4 + 1 / 2))
+    np.testing.assert_allclose(row.of_off, (0.5 / 4 + 0.3 / 2) / (3 / 4))
+    np.testing.assert_allclose(row.of_right, ((0.9 + 0.8 + 0.4) / 4 + 0.6 / 2) / (5 / 4))
+    np.testing.assert_allclose(row.told_apart, 7 / 8)  # of eight pairs, .4 is below .5 alone
+    # A normal error of this size is within 10 % with the median confidence.
+    for spread, stated in ((row.spread_off, 0.4), (row.spread_right, 0.7)):
+        np.testing.assert_allclose(math.erf(0.1 / spread / math.sqrt(2.0)), stated, rtol=1e-6)
+    assert of_walls([Wall(np.zeros(3), np.ones(3))])[0] == 0.0
+
+
+def test_planes_of_truth_are_found_and_their_edges_are_none():
+    row, column = np.mgrid[:80, :120]
+    depth_m = 1.0 / (0.2 + 0.001 * row + 0.0005 * column)
+    depth_m[:, 70:] *= 1.3
+    valid = np.ones(depth_m.shape, bool)
+    valid[:, :10] = False
+    off = off_plane(depth_m, valid)
+    assert off[20:60, 26:54].max() < 1e-5 and off[20:60, 86:].max() < 1e-5
+    assert off[20:60, 66:74].min() > 0.02
+    assert np.isinf(off_plane(depth_m, np.zeros_like(valid))).all()
+
+
 def test_texture_is_the_mean_step_of_brightness_along_rows():
     image = np.zeros((80, 120, 3), np.uint8)
     image[:, ::2] = 51  # a step of a fifth of white at every pixel
@@ -104,7 +136,7 @@ def test_the_command_prints_constants_that_can_be_pasted(capsys):
             exec(line, names)  # as pasted
     assert len(names["LOG_ODDS"]) == 4 and len(names["BY_EVIDENCE"]) == 5
     assert names["BY_EVIDENCE"][-1] == -15.0  # one member has no spread: the shipped number stays
-    assert "largest gap between promised and kept" in printed
+    assert "largest gap between promised and kept" in printed and "plain walls" in printed
 
 
 @pytest.mark.parametrize(
@@ -123,7 +155,7 @@ def test_options_that_would_fit_nothing_are_named(options, said):
 def test_emulated_priors_of_a_pair_are_observed_one_by_one():
     sample = load(find_pairs(Path("synthetic:1@64x96"))[0])
     strong, weak = observe_emulated(sample, ("2%", "20%"))
-    assert strong.evidence[:, 2].mean() > weak.evidence[:, 2].mean()  # the prior's strength
+    assert strong.stated.mean() > weak.stated.mean()
     assert strong.right.mean() > weak.right.mean()
     sparse = replace(sample, valid=np.zeros_like(sample.valid))
     assert observe_emulated(sparse, ("2%",)) == []

@@ -37,7 +37,7 @@ from geodiff_plugin.matching.matches import Matches, reject_reflections
 from geodiff_plugin.pose.estimate import find_scale
 from geodiff_plugin.pose.refine import Displacement, fit_displacement, refined_scale, straightened
 from geodiff_plugin.pose.tracks import Tracks, project_tracks, solve_inverse_depth
-from geodiff_plugin.result.confidence import depth_confidence, reprojection
+from geodiff_plugin.result.confidence import Grounds, depth_confidence, reprojection
 from geodiff_plugin.result.voting import vote_depth
 from geodiff_plugin.scale.points import (
     depth_span,
@@ -373,16 +373,17 @@ def photometry() -> dict[str, object]:
 @part
 def confidence() -> dict[str, object]:
     shape = (1, 1, *SIZE)
-    support, error = (torch.rand(shape, generator=torch.Generator().manual_seed(k)) for k in (0, 1))
-    visible, spread = error > 0.2, 0.1 * support.roll(7, -1)
+    support, other = (torch.rand(shape, generator=torch.Generator().manual_seed(k)) for k in (0, 1))
+    spread = 0.1 * support.roll(7, -1)
+    grounds = Grounds(support**3, 12.0 * support.roll(5, -2), 0.3 * other**3)
     of_prior = {"good": 0.02, "poor": 0.12, "unknown": None}
     result: dict[str, object] = {}
     for name, e in of_prior.items():
         prior_of = None if e is None else torch.full((1, 1, 1, 1), e)
-        result[name] = depth_confidence(support**3, 0.2 * error, visible, None, prior_of)
-        result[f"{name}_spread"] = depth_confidence(support**3, 0.2 * error, visible, spread, prior_of)
-    local = local_error(torch.full((1, 1, 1, 1), 0.03), visible.float())
-    return result | {"local": depth_confidence(support, 0.2 * error, visible, None, local)}
+        result[name] = depth_confidence(grounds, None, prior_of)
+        result[f"{name}_spread"] = depth_confidence(grounds, spread, prior_of)
+    local = local_error(torch.full((1, 1, 1, 1), 0.03), (other > 0.2).float())
+    return result | {"local": depth_confidence(grounds, None, local)}
 
 
 @part

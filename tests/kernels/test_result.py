@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin.matching.rows import RowMatches
-from geodiff_plugin.result.confidence import _warped, depth_confidence
+from geodiff_plugin.result.confidence import Grounds, _warped, depth_confidence
 from geodiff_plugin.result.voting import Voters, _voted
 from tests.kernels.drawn import drawn
 
@@ -66,7 +66,8 @@ def test_confidence(device, seed, batch, size, spread, prior):
     def rand(*shape: int) -> torch.Tensor:
         return torch.rand(batch, 1, *shape, generator=generator).to(device)
 
-    given = rand(*size), 0.3 * rand(*size), rand(*size) > 0.3, 0.1 * rand(*size) if spread else None
+    grounds = Grounds(rand(*size), 12.0 * rand(*size), 0.3 * rand(*size) ** 3)
+    given = grounds, 0.1 * rand(*size) if spread else None
     error = {"none": None, "number": 0.6 * rand(1, 1), "map": 0.6 * rand(*size)}[prior]
     found = depth_confidence(*given, error)
     with without_kernels():

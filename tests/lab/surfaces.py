@@ -35,6 +35,7 @@ from geodiff_plugin.result import finish
 from tests.lab.edges import surface_error
 
 __all__ = ["STAGES", "Flatness", "Stages", "draw_stages", "flatness", "guided_stages", "main"]
+__all__ += ["marked_planes", "of_polygon", "plane_of"]
 
 #: What is measured, in the order of a call: key, heading.
 STAGES = {
@@ -127,18 +128,25 @@ def flatness(depth_m: np.ndarray, inside: np.ndarray) -> Flatness:
 
     A plane in space is a plane in inverse depth over the pixels. Pixels without a depth do not count.
     """
-    row, column = np.nonzero(inside & np.isfinite(depth_m))
-    if len(row) < FEWEST_PIXELS:
+    known = inside & np.isfinite(depth_m)
+    if known.sum() < FEWEST_PIXELS:
         return Flatness(np.nan, np.nan)
-    inverse = 1.0 / depth_m[row, column].astype(np.float64)
-    terms = np.stack([np.ones(len(row)), row - row.mean(), column - column.mean()], 1)
-    residual = inverse - terms @ np.linalg.lstsq(terms, inverse, rcond=None)[0]
+    inverse = 1.0 / depth_m[known].astype(np.float64)
+    residual = inverse - plane_of(depth_m, known)
     spread = 1.4826 * np.median(np.abs(residual - np.median(residual)))
     percent = 100.0 / inverse.mean()
     return Flatness(float(percent * np.sqrt(np.mean(residual**2))), float(percent * spread))
 
 
-def _inside(polygon: Sequence[Sequence[float]], size: tuple[int, int]) -> np.ndarray:
+def plane_of(depth_m: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """``(N,)`` 1/m, the best plane of the inverse depth of ``depth_m (H, W)`` at the pixels ``inside``."""
+    row, column = np.nonzero(inside)
+    terms = np.stack([np.ones(len(row)), row - row.mean(), column - column.mean()], 1)
+    inverse = 1.0 / depth_m[inside].astype(np.float64)
+    return terms @ np.linalg.lstsq(terms, inverse, rcond=None)[0]
+
+
+def of_polygon(polygon: Sequence[Sequence[float]], size: tuple[int, int]) -> np.ndarray:
     """``(H, W)`` bool of a polygon of (x, y)."""
     image = Image.new("1", size[::-1])
     ImageDraw.Draw(image).polygon([tuple(corner) for corner in polygon], fill=1)
@@ -227,7 +235,7 @@ def _relief(depth_m: np.ndarray) -> np.ndarray:
     return np.clip(0.5 + (down + across) / (2.0 * RELIEF), 0.0, 1.0)
 
 
-def _marked(root: Path) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray], Rig, dict[str, Any]]]:
+def marked_planes(root: Path) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray], Rig, dict[str, Any]]]:
     """Name, images, cameras and planes of every pair of a folder with ``PLANES``."""
     rig = read_calibration(root / CALIBRATION)
     for name, planes in json.loads((root / PLANES).read_text()).items():
@@ -261,11 +269,11 @@ def _run(data: Sequence[str], prior: str, seed: int, out: Path | None) -> None:
     console, planes, surfaces = Console(width=150), {}, {}
     for root in data:
         if (Path(root) / PLANES).is_file():
-            for name, images, rig, marked in _marked(Path(root)):
+            for name, images, rig, marked in marked_planes(Path(root)):
                 stages = guided_stages(pipe, images, rig, seed)
                 _describe(console, name, images[0], stages, out)
                 for label, polygon in marked.items():
-                    planes[f"{name}, {label}"] = stages, _inside(polygon, images[0].shape[:2])
+                    planes[f"{name}, {label}"] = stages, of_polygon(polygon, images[0].shape[:2])
             continue
         for ref in find_pairs(root):
             sample = load(ref)

@@ -9,7 +9,7 @@ from geodiff_plugin import _strips as strips
 from geodiff_plugin.formats import flying_points, make_cloud, write_depth_mm, write_ply
 from geodiff_plugin.formats.points import read_ply_points
 from geodiff_plugin.plotting import colour_depth, share_figure
-from geodiff_plugin.result.confidence import depth_confidence, reprojection
+from geodiff_plugin.result.confidence import Grounds, depth_confidence, reprojection
 from geodiff_plugin.types import CameraView
 
 
@@ -59,7 +59,11 @@ def test_rerendering_and_confidence_in_strips(textured_plane, monkeypatch):
         view = CameraView(0.8 * right + 0.1, K, T)  # another exposure, which is taken out
         visible, error = reprojection([view], depth_m, left[None], K[None])
         support = torch.linspace(0, 1, depth_m.numel()).view_as(depth_m)
-        return visible, error, depth_confidence(support, error, visible, None)
+        return (
+            visible,
+            error,
+            depth_confidence(Grounds(support, 9.0 * support, 0.1 * support), None),
+        )
 
     whole = told()
     monkeypatch.setattr(strips, "STRIP_PIXELS", 64 * 7)

@@ -10,8 +10,9 @@ import torch
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError
+from geodiff_plugin.matching import Matches
 from geodiff_plugin.messages import Message
-from geodiff_plugin.result.confidence import depth_confidence
+from geodiff_plugin.result.confidence import Grounds, depth_confidence, grounds_of
 from geodiff_plugin.result.verdict import judge
 from geodiff_plugin.types import Indicators
 from tests.scenes import render_pair
@@ -272,20 +273,39 @@ def _maps(*values: float) -> torch.Tensor:
     return torch.tensor(values).view(1, 1, 1, -1)
 
 
-SEEN = torch.ones(1, 1, 1, 3, dtype=torch.bool)
-
-
 @pytest.mark.parametrize(
-    ("support", "error", "spread", "way"),
-    [
-        ((0.0, 0.95, 1.0), (0.05,) * 3, None, 1),
-        ((0.9,) * 3, (0.0, 0.05, 0.5), None, -1),
-        ((0.9,) * 3, (0.05,) * 3, (0.0, 0.05, 0.5), -1),
-    ],
+    ("support", "spread", "way"),
+    [((0.0, 0.95, 1.0), None, 1), ((0.9,) * 3, (0.0, 0.05, 0.5), -1)],
 )
-def test_rises_with_support_and_falls_with_error_and_spread(support, error, spread, way):
+def test_rises_with_support_and_falls_with_spread(support, spread, way):
     spread = None if spread is None else _maps(*spread)
-    found = depth_confidence(_maps(*support), _maps(*error), SEEN, spread).flatten()
+    grounds = Grounds(_maps(*support), _maps(1.0, 1.0, 1.0), _maps(0.02, 0.02, 0.02))
+    found = depth_confidence(grounds, spread).flatten()
     assert (way * found.diff() > 0).all() and found.min() > 0 and found.max() < 1
-    unseen = depth_confidence(_maps(*support), _maps(*error), ~SEEN, None).flatten()
-    assert len(set(support)) > 1 or unseen[0] == unseen[2]
+
+
+@pytest.mark.parametrize("name", ["apart", "moved"])
+def test_falls_with_the_distance_of_matches_and_with_the_last_correction(name):
+    grounds = Grounds(_maps(0.9, 0.9, 0.9), _maps(1.0, 1.0, 1.0), _maps(0.02, 0.02, 0.02))
+    grounds = grounds._replace(**{name: getattr(grounds, name) * _maps(1.0, 3.0, 9.0)})
+    found = depth_confidence(grounds, None).flatten()
+    assert (found.diff() < -0.02).all()
+
+
+def test_grounds_are_means_over_a_window_of_matches():
+    """Matches two planes off on the left, none on the right; all depths were lowered by a tenth."""
+    depth_m = torch.full((1, 1, 50, 90), 2.0)
+    confidence = torch.zeros(1, 1, 50, 90)
+    confidence[..., :40] = 0.5
+    target = Matches(torch.full_like(confidence, 0.5 + 2 * 0.004), confidence, torch.tensor([0.004]))
+    found = grounds_of(1.1 * depth_m, depth_m, target, 0.3 * torch.ones_like(depth_m))
+    matched = 0.5 * 40 / 90
+    share = matched / (matched + 0.02)
+    moved = math.log(1.1) ** share * 0.2 ** (1 - share)  # the fewer matches, the nearer to the largest
+    torch.testing.assert_close(found.moved, torch.full_like(depth_m, moved))
+    assert (found.support == 0.3).all()
+    # Among matches that are there, beside their border, where the window holds half of them, and far from it.
+    for column, share in ((10, 1.0), (39, 16 / 31), (89, 0.0)):
+        weight = 0.5 * share
+        expected = (2.0 * weight + 0.02 * 10.0) / (weight + 0.02)
+        assert float(found.apart[0, 0, 25, column]) == pytest.approx(expected, rel=1e-3)
