@@ -22,7 +22,7 @@ from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.geometry import resize_image
 from geodiff_plugin.matching import Matches, reject_reflections
 from geodiff_plugin.scale.points import order_agreement
-from geodiff_plugin.scale.space import AffineState, DepthRange, MetricMap, PriorMaps
+from geodiff_plugin.scale.space import AffineState, DepthRange, MetricMap, PriorMaps, joined
 from geodiff_plugin.types import CameraView, PosedViews, StepReport
 
 
@@ -131,7 +131,7 @@ class Trajectory:
             before = None if current is None else current.of(samples)
             valid = None if self.maps.valid is None else self.maps.valid[samples][:1]
             ranges.append(fit_depth_range(x[samples], judged, self.metric, self.config, before, valid))
-        return DepthRange(*(torch.cat(values) for values in zip(*ranges, strict=True)))
+        return DepthRange(*(joined(values) for values in zip(*ranges, strict=True)))
 
     @cached_property
     def _judged(self) -> list[Evidence]:

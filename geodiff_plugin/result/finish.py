@@ -36,6 +36,7 @@ from geodiff_plugin.result.misfit import NO_MISFIT, misfit_of, share_left
 from geodiff_plugin.result.verdict import judge, points_agreement
 from geodiff_plugin.result.voting import vote_depth
 from geodiff_plugin.scale.points import order_agreement
+from geodiff_plugin.scale.space import joined
 from geodiff_plugin.types import Indicators, Verdict
 
 #: Least depth of a metric prior, metres: its nearest pixel may be 0.
@@ -120,7 +121,7 @@ def finish(
     if refined is not None:
         spread = None if uncertainty is None else uncertainty / depth_m
         confidence = depth_confidence(refined.grounds, spread, prior_error)
-    relative = median(torch.cat([member.relative for member in members]), 0)[None]
+    relative = median(joined([member.relative for member in members]), 0)[None]
     measured = _Measured(depth_m, relative, confidence, _over_prior(members, depth_m), visible)
     numbers = read_numbers(_numbers(evidence, members, measured, options))
     verdict = judge(_indicators(evidence, numbers, options))
@@ -131,9 +132,9 @@ def finish(
         depth_m=depth_m,
         K=K[0],
         relative=_resized(relative, image_size(depth_m), antialias=False),
-        scale=torch.cat([member.affine.scale for member in members]),
-        shift=torch.cat([member.affine.shift for member in members]),
-        global_scale=torch.cat([member.affine.g_s for member in members]),
+        scale=joined([member.affine.scale for member in members]),
+        shift=joined([member.affine.shift for member in members]),
+        global_scale=joined([member.affine.g_s for member in members]),
         verdict=verdict,
         visible_share=numbers.get("visible", 1.0),
         uncertainty=uncertainty,
@@ -163,8 +164,10 @@ def _resized(x: Tensor, size: tuple[int, int], antialias: bool = True) -> Tensor
 
 def _within_range(depth_m: Tensor, members: Sequence[Member]) -> Tensor:
     """A map clamped, in place, to the range of the members that it was made of: resizing may overshoot."""
-    near_m, far_m = (torch.cat([getattr(m, name) for m in members]) for name in ("near_m", "far_m"))
-    return depth_m.clamp_(near_m.to(depth_m).amin(0, keepdim=True), far_m.to(depth_m).amax(0, keepdim=True))
+    near_m, far_m = (joined([getattr(m, name) for m in members]).to(depth_m) for name in ("near_m", "far_m"))
+    if len(members) > 1:
+        near_m, far_m = near_m.amin(0, keepdim=True), far_m.amax(0, keepdim=True)
+    return depth_m.clamp_(near_m, far_m)
 
 
 def _farthest_m(evidence: Evidence, config: GuidanceConfig) -> float:
@@ -183,7 +186,9 @@ def _farthest_m(evidence: Evidence, config: GuidanceConfig) -> float:
 def _mean(members: Sequence[Member], name: str) -> Tensor | None:
     """Mean of what was measured of each member, ``(1, 1, h, w)``; ``None`` where nothing was."""
     values = [value for member in members if (value := getattr(member, name)) is not None]
-    return torch.cat(values).float().mean(0, keepdim=True) if values else None
+    if len(values) > 1:
+        return torch.cat(values).float().mean(0, keepdim=True)
+    return values[0].float() if values else None
 
 
 def _error_of(members: Sequence[Member]) -> Tensor | None:
@@ -262,7 +267,7 @@ def _over_prior(members: Sequence[Member], depth_m: Tensor) -> Tensor | None:
     if len(priors_m) < len(members):
         return None
     resized = F.interpolate(depth_m, priors_m[0].shape[-2:], mode="bilinear", align_corners=False)
-    return (resized / torch.cat(priors_m).clamp_min(LEAST_M)).flatten(1)
+    return (resized / joined(priors_m).clamp_min(LEAST_M)).flatten(1)
 
 
 class _Measured(NamedTuple):
@@ -280,7 +285,8 @@ def _numbers(
 ) -> dict[str, Tensor]:
     """What is to be read from the device of one image; if its run used no matches, they are made here."""
     correlations = [m.rank_correlation for m in members if m.rank_correlation is not None]
-    numbers = {"rank_correlation": torch.cat(correlations).nanmean()}
+    together = joined(correlations)
+    numbers = {"rank_correlation": together.nanmean() if len(together) > 1 else together[0]}
     if evidence.matches is None and evidence.native.views:
         with suppress(InputError):  # views without overlap: not judged
             matches = _matched(evidence, options.config)
@@ -289,7 +295,7 @@ def _numbers(
             numbers["rank_correlation"] = correlation.mean()
     edges = [m.on_edge for m in members if m.on_edge is not None]
     if edges:
-        numbers["on_edge"] = torch.cat(edges).any()
+        numbers["on_edge"] = joined(edges).any()
     if measured.confidence is not None:
         numbers["confidence"] = measured.confidence.mean()
     if measured.over_prior is not None and options.has_unit:

@@ -33,6 +33,18 @@ _NEAR_PX = tl.constexpr(voting.NEAR_PX)
 _ROUNDS = tl.constexpr(voting.ROUNDS)
 _MEDIAN = tl.constexpr(voting.MEDIAN)
 _IN_MEDIAN = tl.constexpr(voting.MEDIAN**2)
+_MAP_VOTE = tl.constexpr(voting.MAP_VOTE)
+_WEAK_PRIOR = tl.constexpr(voting.WEAK_PRIOR)
+_LEAST_ERROR = tl.constexpr(voting.LEAST_ERROR)
+_MOST_SOFT = tl.constexpr(voting.MOST_SOFT)
+_SOFT = tl.constexpr(voting.SOFT)
+_LEAST_M = tl.constexpr(voting.LEAST_M)
+_STEP_PX = tl.constexpr(voting.STEP_PX)
+_NEARBY = tl.constexpr(voting.NEARBY)
+_WIDE = tl.constexpr(voting.WIDE)
+_EDGE = tl.constexpr(voting.EDGE)
+_RISE = tl.constexpr(voting.RISE)
+_NEAREST = tl.constexpr(voting.NEAREST)
 _EDGE_PX = tl.constexpr(EDGE_PX)
 _NEAREST_M = tl.constexpr(NEAREST_M)
 _CONSTANT, _CERTAINTY, _CLOSENESS, _STEADINESS, _SPREAD_COUNTS = map(tl.constexpr, confidence.BY_EVIDENCE)
@@ -53,6 +65,8 @@ BLOCK = 64
 WARPS = 8
 #: Votes of a pixel, as a power of two: two of every place in the window, and the map's own.
 VOTES = triton.next_power_of_2(2 * len(voting.WINDOW) + 1)
+#: Votes around a pixel that is enlarged to, as a power of two.
+AROUND = 16
 #: Values that a median is taken of, as a power of two.
 IN_MEDIAN = triton.next_power_of_2(voting.MEDIAN**2)
 
@@ -81,8 +95,18 @@ def _mean_near_median(votes, weight):
 
 
 @triton.jit
+def _error_and_map_vote(error, crispness):
+    """``voting._error_at_edges``, and the weight of the map's own vote."""
+    measured = tl.maximum(tl.load(error), _LEAST_ERROR)
+    soft = tl.exp(tl.log(tl.load(crispness)) * _SOFT)
+    at_edges = tl.maximum(measured, tl.minimum(measured / soft, _MOST_SOFT))
+    better = tl.maximum(1.0 / at_edges * _WEAK_PRIOR, 1.0)
+    return at_edges, better * better * better * _MAP_VOTE
+
+
+@triton.jit
 def vote_kernel(
-    depth_m, inverse_depth, confidence, known, row_shift, matched, filled, image, error, map_vote, voted,
+    depth_m, inverse_depth, confidence, known, row_shift, matched, filled, image, error, crispness, voted,
     px, closeness, height, width, CHANNELS: tl.constexpr, BLOCK: tl.constexpr, VOTES: tl.constexpr,
 ):  # fmt: skip
     """The votes around every pixel, weighed, and the mean of those near their weighted median."""
@@ -104,7 +128,8 @@ def vote_kernel(
     )
     shift = px / tl.load(depth_m + at)  # of the map there
     votes = tl.where(of_row, tl.load(row_shift + at), px * tl.load(inverse_depth + at))
-    noise = tl.minimum(tl.load(error), _ERROR_OF_VOTES)
+    at_edges, map_vote = _error_and_map_vote(error, crispness)
+    noise = tl.minimum(at_edges, _ERROR_OF_VOTES)
     apart = tl.log(tl.maximum(votes, 0.1) / shift)
     apart = 1.0 + apart * apart / ((noise * noise + 1.0 / (shift * shift)) * (_DIFFERS * _DIFFERS))
     unlike = tl.zeros_like(shift)
@@ -116,16 +141,15 @@ def vote_kernel(
 
     own_shift = (px / tl.load(depth_m + own))[:, None]
     is_vote = (vote < 2 * _VOTERS)[None, :]
-    weight = tl.where(
-        is_vote, weight, tl.where(vote == 2 * _VOTERS, tl.load(map_vote) * closeness, 0.0)[None, :]
-    )
+    weight = tl.where(is_vote, weight, tl.where(vote == 2 * _VOTERS, map_vote * closeness, 0.0)[None, :])
     tl.store(voted + pixel, _mean_near_median(tl.where(is_vote, votes, own_shift), weight), exists)
 
 
 @triton.jit
 def median_kernel(
-    voted, confidence, map_vote, smooth, height, width, BLOCK: tl.constexpr, IN_MEDIAN: tl.constexpr
-):
+    voted, confidence, error, crispness, smooth, height, width,
+    BLOCK: tl.constexpr, IN_MEDIAN: tl.constexpr,
+):  # fmt: skip
     """The median of the square around every pixel, where matches outvote the map and nothing is known."""
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     exists = pixel < height * width
@@ -143,7 +167,8 @@ def median_kernel(
             value = tl.load(voted + at)
             below = tl.sum(tl.where(values <= value[:, None], counts, 0), 1)
             median = tl.minimum(median, tl.where(2 * below > _IN_MEDIAN, value, float("inf")))
-    most = tl.where(tl.load(map_vote) < 1.0, 1.0, -1.0)
+    _at_edges, map_vote = _error_and_map_vote(error, crispness)
+    most = tl.where(map_vote < 1.0, 1.0, -1.0)
     smoothed = tl.load(confidence + own) <= most
     tl.store(smooth + pixel, tl.where(smoothed, median, tl.load(voted + own)), exists)
 
@@ -266,7 +291,7 @@ def warped(
     return image, visible
 
 
-def voted(given: voting.Voters, left: Tensor, error: Tensor, map_vote: Tensor) -> Tensor:
+def voted(given: voting.Voters, left: Tensor, error: Tensor, crispness: Tensor) -> Tensor:
     """``voting._voted``."""
     height, width = given.depth_m.shape
     maps = [each.contiguous() for each in (*given[:4], *given.rows[:3], left)]
@@ -276,7 +301,7 @@ def voted(given: voting.Voters, left: Tensor, error: Tensor, map_vote: Tensor) -
     launched_on(left, vote_kernel[grid])(
         *maps,
         error,
-        map_vote,
+        crispness,
         raw,
         float(given.px),
         closeness,
@@ -288,6 +313,109 @@ def voted(given: voting.Voters, left: Tensor, error: Tensor, map_vote: Tensor) -
         num_warps=WARPS,
     )
     launched_on(left, median_kernel[grid])(
-        raw, maps[2], map_vote, smooth, height, width, BLOCK=BLOCK, IN_MEDIAN=IN_MEDIAN, num_warps=WARPS
+        raw,
+        maps[2],
+        error,
+        crispness,
+        smooth,
+        height,
+        width,
+        BLOCK=BLOCK,
+        IN_MEDIAN=IN_MEDIAN,
+        num_warps=WARPS,
     )
     return smooth
+
+
+@triton.jit
+def share_kernel(depth_m, share, height, width, PIXELS: tl.constexpr):
+    """``voting._step_shares``, on the whole map."""
+    pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    exists = pixel < height * width
+    row, column = pixel // width, pixel % width
+    rim = tl.minimum(tl.minimum(row, height - 1 - row), tl.minimum(column, width - 1 - column))
+    inner = exists & (rim >= _WIDE)
+    lowest = tl.full([PIXELS], float("inf"), tl.float32)
+    highest = tl.full([PIXELS], float("-inf"), tl.float32)
+    low, high, step = lowest, highest, tl.zeros([PIXELS], tl.float32)
+    for down in range(-_WIDE, _WIDE + 1):
+        for right in range(-_WIDE, _WIDE + 1):
+            depth = tl.load(depth_m + pixel + down * width + right, inner, 1.0)
+            lowest, highest = tl.minimum(lowest, depth), tl.maximum(highest, depth)
+    for down in range(-_NEARBY, _NEARBY + 1):
+        for right in range(-_NEARBY, _NEARBY + 1):
+            at = depth_m + pixel + down * width + right
+            depth = tl.load(at, inner, 1.0)
+            low, high = tl.minimum(low, depth), tl.maximum(high, depth)
+            log_depth = tl.log(tl.maximum(depth, _LEAST_M))
+            across = log_depth - tl.log(tl.maximum(tl.load(at - _STEP_PX, inner, 1.0), _LEAST_M))
+            along = log_depth - tl.log(tl.maximum(tl.load(at - _STEP_PX * width, inner, 1.0), _LEAST_M))
+            step = tl.maximum(step, tl.maximum(tl.abs(across), tl.abs(along)))
+    near = tl.log(tl.maximum(high, _LEAST_M)) - tl.log(tl.maximum(low, _LEAST_M))
+    wide = tl.log(tl.maximum(highest, _LEAST_M)) - tl.log(tl.maximum(lowest, _LEAST_M))
+    at_edge = inner & (near > _EDGE) & (wide < near * _RISE)
+    tl.store(share + pixel, tl.where(at_edge, step / tl.where(at_edge, near, 1.0), float("nan")), exists)
+
+
+def step_shares(depth_m: Tensor) -> Tensor:
+    """``voting._step_shares``, with its rim."""
+    share = torch.empty_like(depth_m)
+    launched_on(depth_m, share_kernel[(triton.cdiv(depth_m.numel(), PIXELS),)])(
+        depth_m, share, *depth_m.shape, PIXELS=PIXELS, num_warps=WARPS
+    )
+    return share
+
+
+@triton.jit
+def _rounded(x):
+    """The nearest integer, of two the even one, as a float."""
+    below = tl.floor(x)
+    part = x - below
+    is_odd = below - 2.0 * tl.floor(below / 2.0)
+    return below + tl.where((part > 0.5) | ((part == 0.5) & (is_odd > 0.5)), 1.0, 0.0)
+
+
+@triton.jit
+def enlarge_kernel(
+    voted, image, whole, large, rows, columns, height, width,
+    CHANNELS: tl.constexpr, BLOCK: tl.constexpr, AROUND: tl.constexpr,
+):  # fmt: skip
+    """``voting._enlarged``. Grid: blocks of pixels."""
+    pixel = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    pixels = height.to(tl.int64) * width
+    exists = pixel < pixels
+    own = tl.minimum(pixel, pixels - 1)
+    y = ((own // width).to(tl.float32) + 0.5) * (rows / height) - 0.5
+    x = ((own % width).to(tl.float32) + 0.5) * (columns / width) - 0.5
+    vote = tl.arange(0, AROUND)
+    is_vote = (vote < 9)[None, :]
+    place = tl.minimum(vote, 8)
+    v = _rounded(y)[:, None] + (place // 3 - 1).to(tl.float32)[None, :]
+    u = _rounded(x)[:, None] + (place % 3 - 1).to(tl.float32)[None, :]
+    at = _inside(v.to(tl.int32), u.to(tl.int32), rows, columns)
+    unlike = tl.zeros_like(v)
+    for channel in tl.static_range(CHANNELS):
+        colour = tl.load(whole + channel * pixels + own)
+        unlike += tl.abs(tl.load(image + channel * rows * columns + at) - colour[:, None])
+    v, u = v - y[:, None], u - x[:, None]
+    weight = tl.exp(-unlike / (CHANNELS * _BRIGHTNESS) - (v * v + u * u) * _NEAREST)
+    result = _mean_near_median(tl.load(voted + at), tl.where(is_vote, weight, 0.0))
+    tl.store(large + pixel, result, exists)
+
+
+def enlarged(votes: Tensor, left: Tensor, whole: Tensor) -> Tensor:
+    """``voting._enlarged``."""
+    size = image_size(whole)
+    large = votes.new_empty(size)
+    launched_on(votes, enlarge_kernel[(triton.cdiv(large.numel(), BLOCK),)])(
+        votes.contiguous(),
+        left.contiguous(),
+        whole.contiguous(),
+        large,
+        *image_size(left),
+        *size,
+        CHANNELS=len(whole),
+        BLOCK=BLOCK,
+        AROUND=AROUND,
+    )
+    return large

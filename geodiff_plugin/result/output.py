@@ -14,6 +14,7 @@ from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.estimate import NO_UNIT
 from geodiff_plugin.result.finish import ImageResult
+from geodiff_plugin.scale.space import joined
 from geodiff_plugin.types import MetricDepthOutput, StepReport
 
 #: The user is warned if the visible share is below this: few pixels then determine the scale.
@@ -70,7 +71,7 @@ def _together(results: Sequence[ImageResult], name: str) -> Tensor | None:
     given = [each for result in results if (each := getattr(result, name)) is not None]
     if len(given) < len(results):
         return None
-    return given[0] if len(given) == 1 else torch.cat(given)
+    return joined(given)
 
 
 def _numbers(results: Sequence[ImageResult], over_prior: Tensor | None) -> dict[str, Tensor]:

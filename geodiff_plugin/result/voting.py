@@ -63,12 +63,18 @@ LEAST_CRISP = 0.1
 SOFT = 4.0
 #: Up to which error: the matches of a soft map are no better for it.
 MOST_SOFT = 0.14
+#: Least error of a prior that makes a difference.
+LEAST_ERROR = 1e-3
+#: Least depth whose logarithm is taken, metres.
+LEAST_M = 1e-9
 #: Votes within about this many pixels of the median make the mean.
 NEAR_PX = 1.0
 #: Halvings that find a weighted median.
 ROUNDS = 7
 #: As ``STRIP``, where a launch costs more than a cache gives: some 200 MB of votes.
 STRIP_OF_DEVICE = 1 << 18
+#: Fall of a vote's weight with its squared distance, pixels of the voting grid, where votes are enlarged.
+NEAREST = 2.0
 #: Side of the last median filter, pixels of the voting grid.
 MEDIAN = 5
 
@@ -134,24 +140,26 @@ def vote_depth(
         for each in (depth_m, target.inverse_depth, target.confidence, known)
     )
     px = K[0, 0] * rows.baseline_m
-    error = _error_at_edges(error, small_m, size[1] / full[1] * spacing)
-    map_vote = MAP_VOTE * (WEAK_PRIOR / error).clamp_min(1.0) ** 3
-    voted = _voted(Voters(small_m, inverse_depth, confidence, known, rows, px), left, error, map_vote)
+    coarseness = max(1.0, size[1] / full[1] * spacing / STEP_PX)  # a coarse grid places no edge well
+    given = Voters(small_m, inverse_depth, confidence, known, rows, px)
+    voted = _voted(given, left, error, _crispness(small_m) / coarseness)
     if size != full:
         voted = _enlarged(voted, left, _resized(evidence.native, full)[0])
-    out_m = (px / voted.clamp_min(1e-6))[None, None].clamp(depth_m.amin(), depth_m.amax())
+    out_m = (px / voted.clamp_min(1e-6))[None, None].clamp(*depth_m.aminmax())
     return out_m.to(depth_m.dtype)
 
 
-def _voted(given: Voters, left: Tensor, error: Tensor, map_vote: Tensor) -> Tensor:
-    """``(H, W)`` pixels of shift that the voters agree on; ``map_vote ()`` is the weight of the map.
+def _voted(given: Voters, left: Tensor, error: Tensor, crispness: Tensor) -> Tensor:
+    """``(H, W)`` pixels of shift that the voters agree on.
 
-    ``left (3, H, W)`` is the image, ``error ()`` that of the prior.
+    ``left (3, H, W)`` is the image, ``error (1, 1, 1, 1)`` that of the prior, ``crispness ()`` of its map.
     """
     if use_kernel(left):
         from geodiff_plugin.result import kernels
 
-        return kernels.voted(given, left, error, map_vote)
+        return kernels.voted(given, left, error, crispness)
+    error = _error_at_edges(error, crispness)
+    map_vote = MAP_VOTE * (WEAK_PRIOR / error).clamp_min(1.0) ** 3
     rows, shift = given.rows, given.px / given.depth_m
     of_rows = given.known * (ROWS * rows.matched + FILLED * rows.filled)
     # The confidence of a known point is a count.
@@ -196,10 +204,9 @@ def _rows_at_once(like: Tensor) -> int:
     return max(1, (STRIP_OF_DEVICE if launch_bound(like) else STRIP) // like.shape[-1])
 
 
-def _error_at_edges(error: Tensor, depth_m: Tensor, spacing: float) -> Tensor:
-    """``()`` the prior's error, larger for a map ``(H, W)`` with soft edges; ``spacing`` of its pixels."""
-    error = error.flatten()[0].clamp_min(1e-3)
-    crispness = _crispness(depth_m) / max(1.0, spacing / STEP_PX)  # a coarse grid places no edge well
+def _error_at_edges(error: Tensor, crispness: Tensor) -> Tensor:
+    """``()`` the prior's error, larger for a map with soft edges."""
+    error = error.flatten()[0].clamp_min(LEAST_ERROR)
     return torch.maximum(error, (error / crispness**SOFT).clamp_max(MOST_SOFT))
 
 
@@ -208,13 +215,22 @@ def _crispness(depth_m: Tensor) -> Tensor:
 
     The median over edges: pixels inside with a step nearby that is not the slope of a wide surface.
     """
-    log_depth = depth_m.clamp_min(1e-9).log()[None, None]
+    share = _step_shares(depth_m.contiguous())
+    return (share.flatten().nanmedian().nan_to_num(1.0) / CRISP).clamp(LEAST_CRISP, 1.0)
+
+
+def _step_shares(depth_m: Tensor) -> Tensor:
+    """That share at every edge of a map ``(H, W)``, and NaN elsewhere and within ``WIDE`` of the rim."""
+    if use_kernel(depth_m):
+        from geodiff_plugin.result import kernels
+
+        return kernels.step_shares(depth_m)
+    log_depth = depth_m.clamp_min(LEAST_M).log()[None, None]
     across, down = ((log_depth - log_depth.roll(STEP_PX, axis)).abs() for axis in (-1, -2))
     near, wide = (range_around(log_depth, reach) for reach in (NEARBY, WIDE))
     at_edge = (near > EDGE) & (wide < RISE * near)
     step = highest(torch.maximum(across, down), NEARBY)
-    share = torch.where(at_edge, step / near, torch.nan)[..., WIDE:-WIDE, WIDE:-WIDE]
-    return (share.flatten().nanmedian().nan_to_num(1.0) / CRISP).clamp(LEAST_CRISP, 1.0)
+    return torch.where(at_edge, step / near, torch.nan)[0, 0, WIDE:-WIDE, WIDE:-WIDE]
 
 
 def _weighed(votes: _Votes, shift: Tensor, error: Tensor) -> _Votes:
@@ -285,6 +301,10 @@ def _mean_near_median(votes: Tensor, weights: Tensor) -> Tensor:
 
 def _enlarged(voted: Tensor, left: Tensor, whole: Tensor) -> Tensor:
     """``(H, W)`` votes at the size of ``whole (3, H, W)``, from the 9 nearest ones of similar colour."""
+    if use_kernel(voted):
+        from geodiff_plugin.result import kernels
+
+        return kernels.enlarged(voted, left, whole)
     (height, width), (rows, columns) = image_size(whole), image_size(left)
     out = voted.new_empty(height, width)
     x = (torch.arange(width, device=voted.device, dtype=voted.dtype) + 0.5) * (columns / width) - 0.5
@@ -301,6 +321,6 @@ def _enlarged(voted: Tensor, left: Tensor, whole: Tensor) -> Tensor:
                 unlike = (left[:, row, column] - whole[:, part]).abs().mean(0) / BRIGHTNESS
                 away = (v - y)[:, None] ** 2 + (u - x) ** 2
                 votes.append(voted[row, column])
-                weights.append(torch.exp(-unlike - 2.0 * away))
+                weights.append(torch.exp(-unlike - NEAREST * away))
         out[part] = _mean_near_median(torch.stack(votes), torch.stack(weights))
     return out

@@ -5,7 +5,7 @@ S4.1, Eq. 10 and 13 (eq:metric), Eq. 16 (no label); ``square`` is Marigold-DC's 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
@@ -47,6 +47,11 @@ def smooth_floor(x: Tensor, eps: float = FLOOR_EPS) -> Tensor:
 def inverse_softplus(y: Tensor) -> Tensor:
     """Raw value whose softplus is ``y``; ``y > 0``, any shape."""
     return y + torch.log(-torch.expm1(-y))
+
+
+def joined(parts: Sequence[Tensor]) -> Tensor:
+    """Tensors along the first axis; a single one is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
 
 
 @dataclass(frozen=True)

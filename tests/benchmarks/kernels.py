@@ -107,9 +107,16 @@ def _of_the_result() -> Iterator[Compiled]:
     yield Compiled("sharp edges", edge_kernels.sharpen_kernel, sharpen, sizes, warps)
     sizes = {"CHANNELS": 3, "BLOCK": result.BLOCK, "VOTES": result.VOTES}
     vote = 11 * "*fp32 " + "fp32 fp32 i32 i32"
+    enlarge, around = (
+        4 * "*fp32 " + 4 * "i32 ",
+        {"CHANNELS": 3, "BLOCK": result.BLOCK, "AROUND": result.AROUND},
+    )
+    yield Compiled("enlarged votes", result.enlarge_kernel, enlarge, around, 4)
+    share = "*fp32 *fp32 i32 i32"
+    yield Compiled("crispness", result.share_kernel, share, {"PIXELS": result.PIXELS}, result.WARPS)
     yield Compiled("votes", result.vote_kernel, vote, sizes, result.WARPS)
     sizes = {"BLOCK": result.BLOCK, "IN_MEDIAN": result.IN_MEDIAN}
-    median = "*fp32 *fp32 *fp32 *fp32 i32 i32"
+    median = "*fp32 *fp32 *fp32 *fp32 *fp32 i32 i32"
     yield Compiled("median of votes", result.median_kernel, median, sizes, result.WARPS)
     sizes = {"SPREAD": True, "PRIOR": 2, "PIXELS": result.PIXELS}
     confidence = 6 * "*fp32 " + "i32"

@@ -50,7 +50,9 @@ WITH_KERNELS = (
     "fit_to_points",
     "refine_to_matches",
     "sharpen_edges",
+    "_step_shares",
     "_voted",
+    "_enlarged",
     "_warped",
     "depth_confidence",
 )

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin.matching.rows import RowMatches
 from geodiff_plugin.result.confidence import Grounds, _warped, depth_confidence
-from geodiff_plugin.result.voting import Voters, _voted
+from geodiff_plugin.result.voting import WIDE, Voters, _crispness, _enlarged, _step_shares, _voted
 from tests.kernels.drawn import drawn
 
 
@@ -33,17 +33,16 @@ def random_voters(seed: int, size: tuple[int, int], device: torch.device) -> tup
     seed=st.integers(0, 999),
     size=st.tuples(st.integers(2, 30), st.integers(2, 30)),
     error=st.floats(0.01, 0.3),
-    map_vote=st.floats(0.01, 2.0),
+    crispness=st.floats(0.1, 1.0),
 )
-@example(seed=0, size=(21, 33), error=0.08, map_vote=0.05)
-@example(seed=1, size=(17, 9), error=0.02, map_vote=1.5)
-def test_votes(device, seed, size, error, map_vote):
+@example(seed=0, size=(21, 33), error=0.08, crispness=0.7)
+@example(seed=1, size=(17, 9), error=0.02, crispness=1.0)  # this map outvotes its matches
+def test_votes(device, seed, size, error, crispness):
     voters, left = random_voters(seed, size, device)
-    numbers = (torch.tensor(value, device=device) for value in (error, map_vote))
-    error, map_vote = numbers
-    found = _voted(voters, left, error, map_vote)
+    numbers = torch.full((1, 1, 1, 1), error, device=device), torch.tensor(crispness, device=device)
+    found = _voted(voters, left, *numbers)
     with without_kernels():
-        expected = _voted(voters, left, error, map_vote)
+        expected = _voted(voters, left, *numbers)
     # Where a half of the weight is reached is found by comparing sums, which rounding may decide otherwise.
     off = ((found - expected).abs() > 1e-5 * expected.abs().amax()).float().mean()
     assert off <= 5e-3 and found.isfinite().all()
@@ -101,3 +100,38 @@ def test_a_right_image_seen_from_the_left(device, seed, size, size_right, turn):
     assert (seen != visible).float().mean() <= 2e-3
     off = ((found - expected).abs().amax(1) > 1e-3).float().mean()
     assert off <= 5e-3 and (found - expected).abs().mean() < 1e-5
+
+
+@drawn(2)
+@given(seed=st.integers(0, 999), size=st.tuples(st.integers(25, 35), st.integers(25, 35)))
+@example(seed=0, size=(31, 37))
+def test_steps_of_a_map_and_their_crispness(device, seed, size):
+    generator = torch.Generator().manual_seed(seed)
+    coarse = 1.0 + 4.0 * torch.rand(1, 1, *(-(-side // 12) for side in size), generator=generator)
+    depth_m = torch.nn.functional.interpolate(coarse, size, mode="bilinear")[0, 0].to(device)
+    found, crisp = _step_shares(depth_m)[WIDE:-WIDE, WIDE:-WIDE], _crispness(depth_m)
+    with without_kernels():
+        expected, expected_crisp = _step_shares(depth_m), _crispness(depth_m)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=0.0, equal_nan=True)
+    torch.testing.assert_close(crisp, expected_crisp, rtol=1e-4, atol=0.0)
+
+
+@drawn(3)
+@given(
+    seed=st.integers(0, 999),
+    size=st.tuples(st.integers(2, 15), st.integers(2, 15)),
+    larger=st.tuples(st.floats(1.0, 4.0), st.floats(1.0, 4.0)),
+)
+@example(seed=0, size=(13, 9), larger=(2.0, 3.0))
+@example(seed=1, size=(8, 10), larger=(1.5, 1.0))
+def test_enlarged_votes(device, seed, size, larger):
+    generator = torch.Generator().manual_seed(seed)
+    full = tuple(round(side * factor) for side, factor in zip(size, larger, strict=True))
+    voted = 20.0 * torch.rand(*size, generator=generator).to(device)
+    left, whole = (torch.rand(3, *each, generator=generator).to(device) for each in (size, full))
+    found = _enlarged(voted, left, whole)
+    with without_kernels():
+        expected = _enlarged(voted, left, whole)
+    # As of the votes; and a pixel half way between two may be rounded to either.
+    off = ((found - expected).abs() > 1e-5 * expected.abs().amax()).float().mean()
+    assert off <= 5e-3 and found.isfinite().all()
