@@ -28,6 +28,8 @@ DEPTH_COLOURS = "plasma"
 #: Colours of shares and probabilities, likewise, and not to be taken for depth.
 SHARE_COLOURS = "YlGnBu_r"
 GREY = 128
+#: Steps of a colour map: more than a picture of 8 bits can show of one colour.
+SHADES = 1024
 #: Share of the pixels beyond either end of the colours, so that one outlier does not flatten the rest.
 TAIL_PERCENT = 2.0
 #: The ends of the colours are those of so many pixels of a larger map, or of all maps of a video.
@@ -94,17 +96,22 @@ def ticks(near: float, far: float, most: int = 8) -> list[float]:
     return [float(f"{value:.6g}") for value in values if near <= value <= far]
 
 
+@functools.cache
+def _table(colours: str) -> np.ndarray:
+    """``(SHADES, 3)`` uint8 of a colour map."""
+    import matplotlib
+
+    return matplotlib.colormaps[colours].resampled(SHADES)(np.arange(SHADES), bytes=True)[:, :3]
+
+
 def _coloured(
     values: np.ndarray, use: np.ndarray, share_of: Callable[[Any], Any], colours: str
 ) -> np.ndarray:
     """``(H, W, 3)`` uint8 of a map; ``share_of`` tells each value's place among the colours."""
-    import matplotlib
-
-    table = matplotlib.colormaps[colours].resampled(1024)
     picture = np.full((*values.shape, 3), GREY, np.uint8)
     for rows in row_strips(*values.shape):
-        shares = share_of(values[rows][use[rows]].astype(np.float64))
-        picture[rows][use[rows]] = table(np.clip(shares, 0.0, 1.0), bytes=True)[..., :3]
+        shares = np.clip(share_of(values[rows][use[rows]].astype(np.float64)), 0.0, 1.0)
+        picture[rows][use[rows]] = _table(colours)[np.minimum(shares * SHADES, SHADES - 1).astype(np.intp)]
     return picture
 
 
