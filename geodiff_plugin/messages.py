@@ -405,6 +405,25 @@ MESSAGES: dict[str, MessageKind] = {
         cure="Rectify the pictures, or give a calibration that holds the distortion.",
         forbids_trust=True,
     ),
+    "views.bent": MessageKind(
+        "Residuals change over the pictures",
+        cause="E has a wrong rotation, the right picture is sheared by a rolling shutter, or lens distortion "
+        "was not removed: the matches fit each of them.",
+        cure="Check the rotation in E, and that the pictures are rectified with this calibration.",
+        forbids_trust=True,
+    ),
+    "views.sheared": MessageKind(
+        "Upright lines lean in the right picture",
+        cause="A rolling shutter read its rows out one after the other while the camera or the scene moved.",
+        cure="Use a camera with a global shutter, or hold everything still.",
+        forbids_trust=True,
+    ),
+    "views.torn": MessageKind(
+        "A picture is torn",
+        cause="A frame was read out while the next one replaced it, or lines of it were lost.",
+        cure="Take another frame; synchronise read-out and exposure.",
+        forbids_trust=True,
+    ),
     "views.overlap": MessageKind(
         "The views overlap little",
         cause="A small share of the left image is seen by a right camera.",

@@ -64,6 +64,14 @@ class Rig:
         return np.linalg.inv(self.E)
 
 
+class Tear(NamedTuple):
+    """From ``row`` on, of the left picture (``view`` 0) or a right one, pixels lie ``px`` to the right."""
+
+    view: int
+    row: int
+    px: int
+
+
 @dataclass(frozen=True, eq=False)
 class PoseReport:
     """Poses of one image's right views: as given, as used, and how well they fit the matches.
@@ -86,6 +94,8 @@ class PoseReport:
     behind_infinity: float = math.nan  # share of the matches at which the rays of the poses as used diverge
     behind_px: float = math.nan  # how far behind infinity the farthest of them lie; 0 where hardly any do
     distortion: float = math.nan  # radial coefficient k1 that both pictures still have for certain
+    distortion_alone: float = math.nan  # what of it neither a turn nor a shear of the right picture explains
+    tear: Tear | None = None  # where a picture is torn
     warnings: tuple[Message, ...] = ()
 
 
@@ -162,6 +172,9 @@ class Indicators:
     behind_infinity: float = math.nan  # share of the matches at which the two cameras' rays diverge
     behind_px: float = math.nan  # how far behind infinity the farthest lie, pixels of the left image
     distortion: float = math.nan  # k1 that both pictures still have for certain
+    distortion_alone: float = math.nan  # what of it neither a turn nor a shear of the right picture explains
+    tear: Tear | None = None  # where a picture is torn
+    shear: float = math.nan  # of the right picture from its first row to its last, in shares of its width
     off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
     doubts: tuple[Message, ...] = ()  # warnings about the input, each of which forbids trust
     mistakes: tuple[Message, ...] = ()  # of a given pose, that would explain its misfit (``pose.mistakes``)
@@ -176,8 +189,9 @@ class Verdict:
     """Whether one image's depth can be trusted: whether anything in the pictures speaks against it.
 
     They cannot show a wrong length of the baseline, nor, of a rectified pair, a wrong focal length. Of what
-    shifts matches along their epipolar lines they show only what puts things behind infinity: cx of the right
-    camera, the yaw of nearly parallel ones, a stretched picture, a rolling shutter, moving things.
+    shifts matches along their epipolar lines (cx of the right camera, the yaw of nearly parallel ones, a
+    stretched picture, a rolling shutter, moving things) they show what puts things behind infinity, a torn
+    picture, and a shear of upright lines.
     """
 
     status: str  # "trusted", "not trusted", or "not judged": there was nothing to compare it with

@@ -82,13 +82,15 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         "pair of ROS camera_info (projection_matrix)",
         r"^(projection_matrix|distortion_model|rectification_matrix)\s*:", robotics.read_ros, (2,)),
     "stereodemo": CalibrationFormat(
-        "stereodemo JSON (fx)", _JSON + r'(?=[\s\S]*"fx")', stereo.read_stereodemo),
+        "stereodemo JSON, or lines of names and numbers (fx)",
+        _JSON + rf'(?=[\s\S]*"fx")|^[ \t]*fx[ \t]*[:=][ \t]*{_NUMBER}', stereo.read_stereodemo),
     "colmap": CalibrationFormat(
         "COLMAP model (cameras.txt and images.txt)", colmap.MARK, colmap.read_colmap, (2,), by_image=True,
         as_stored=True),
     # Whatever JSON is left: which names it lacks is the best that can be said of it.
     "named": CalibrationFormat(
-        "JSON or .npz of named matrices (K1, D1, K2, D2, R, T)", r"\A\s*\{", storage.read_opencv),
+        "JSON, YAML or .npz of named matrices (K1, D1, K2, D2, R, T)",
+        r"\A\s*\{|^(?i:K|M|mtx|camera_?matrix|intrinsics?)(?i:_?(?:1|l|left))?[ \t]*:", storage.read_opencv),
 }  # fmt: skip
 
 

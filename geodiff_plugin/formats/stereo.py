@@ -30,6 +30,8 @@ CM_PER_METRE = 100.0
 ENTRY = re.compile(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*?)[ \t]*$", re.MULTILINE)
 #: Files are printed with three decimals, so an honest cam1 agrees with doffs better than this.
 DOFFS_TOLERANCE_PX = 0.05
+#: A number by its name, as YAML, TOML and people write it.
+NAMED_NUMBER = re.compile(r"^[ \t]*(\w+)[ \t]*[:=][ \t]*([-+.\deE]+)[ \t]*(?:#.*)?$", re.MULTILINE)
 PROJECTION = re.compile(r"(P_rect_|P)(\d+)")
 PAIRS = ((0, 1), (2, 3))
 #: Folder names of the benchmarks: image_2 and image_02, and colored_0 of KITTI 2012.
@@ -53,7 +55,7 @@ def read_middlebury(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     entries = dict(ENTRY.findall(texts[0]))
     has_right = "cam1" in entries
     K_left, K_right = (
-        array_of(re.split(r"[\s;]+", entries[key].strip("[] \t")), (3, 3), key)
+        array_of(re.split(r"[\s;,]+", entries[key].strip("[] \t")), (3, 3), key)
         for key in ("cam0", "cam1" if has_right else "cam0")
     )
     if "doffs" in entries or not has_right:
@@ -78,8 +80,8 @@ def read_foundation_stereo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 
 
 def read_stereodemo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """Older files have one principal point for both images."""
-    data = json.loads(texts[0])
+    """Older files have one principal point for both; lines ``fx: 500`` or ``fx = 500`` are read too."""
+    data = json.loads(texts[0]) if texts[0].lstrip()[:1] == "{" else dict(NAMED_NUMBER.findall(texts[0]))
     size = data.get("width"), data.get("height")
     columns = ("cx", "cx") if "cx" in data else ("cx0", "cx1")
     left, right = (Camera(intrinsics(data["fx"], data["fy"], data[cx], data["cy"]), size) for cx in columns)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from geodiff_plugin.geometry import image_size, is_rectified, resize_image, to_device_of
 from geodiff_plugin.matching.census import grey
+from geodiff_plugin.matching.uprights import certain_shear
 from geodiff_plugin.types import CameraView, PosedViews
 
 #: Parameters of OpenCV's matcher: keep what both views agree on, and drop speckles.
@@ -37,6 +38,7 @@ class RowMatches(NamedTuple):
     matched: Tensor  # 1 where both views agree, else 0
     filled: Tensor  # 1 in a gap between two matches, where the shift is that of the farther one
     baseline_m: Tensor  # () distance of the cameras, metres, on the CPU
+    shear: float = math.nan  # of the right picture along its rows, pixels per row, as far as it is certain
 
 
 def make_matcher(lowest: int, count: int, channels: int) -> Any:
@@ -123,7 +125,8 @@ def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: fl
     shift = raw.astype(np.float32) / 16.0 - np.float32(infinity)
     known = (raw > 16 * (lowest - 1)) & (shift >= MIN_SHIFT_PX)
     between = np.logical_or.accumulate(known, 1) & np.logical_or.accumulate(known[:, ::-1], 1)[:, ::-1]
+    shear = certain_shear(np.ascontiguousarray(images[0]), shift, known)
     shift = np.nan_to_num(fill_background(np.where(known, shift, np.float32(np.nan))))
     maps = np.stack([shift, known, between & ~known])
     shift_on, matched, filled = to_device_of(left_01, maps[..., ::-1] if mirrored else maps)
-    return RowMatches(shift_on, matched, filled, torch.tensor(abs(T[0, 3]), device="cpu"))
+    return RowMatches(shift_on, matched, filled, torch.tensor(abs(T[0, 3]), device="cpu"), shear)

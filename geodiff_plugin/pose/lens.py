@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from geodiff_plugin.pose.tracks import FEWEST, TINY, Tracks, blocks, epipolar
 
@@ -16,6 +17,8 @@ MOST_OFF_PX = 12.0
 STEPS = 6
 #: Step of the numerical derivative by k1.
 STEP_K1 = 0.01
+#: The same by a turn, radians.
+STEP_TURN = 1e-4
 #: No lens of a camera with a rectilinear picture has more.
 MOST_K1 = 0.6
 #: So many standard errors of an estimate are not counted.
@@ -50,37 +53,66 @@ def _residuals(pair: _Pair, k1s: Sequence[float]) -> np.ndarray:
     return off / np.maximum(np.hypot(of_left[..., 3], of_left[..., 4]), TINY)
 
 
-def remaining_distortion(tracks: Tracks, T: np.ndarray) -> float:
+class Remaining(NamedTuple):
     """The radial coefficient k1, of OpenCV's model, that both pictures still have for certain.
 
-    It minimises ``sum_i rho(e_i(k1) + c)``, with ``e_i`` the signed distance of match i from its epipolar
-    line when ``k1`` is removed from both pictures, ``c`` a shift across the lines, and Cauchy's ``rho``;
-    the estimate is moved towards 0 by ``UNCERTAIN`` standard errors. The standard error is the larger of two:
-    as if matches erred independently, and as the sums over blocks of the left image show, since neighbours
-    err alike.
-
-    Args:
-        tracks: of one right view.
-        T: ``(4, 4)`` ``T_right_from_left``.
-
-    Returns:
-        ``k1``; 0 where nothing is certain, NaN for too few matches.
+    ``alone`` is what of it is certain too where the right camera may be turned, or its picture sheared or
+    stretched: what they explain as well is not known to be a distortion. 0 where nothing is certain, NaN for
+    too few matches.
     """
+
+    k1: float
+    alone: float
+
+
+def remaining_distortion(tracks: Tracks, T: np.ndarray) -> Remaining:
+    """The distortion that matches of one right view show under ``T (4, 4)``, ``T_right_from_left``."""
     tracks = tracks.kept(np.abs(epipolar(tracks, T).off_px) < MOST_OFF_PX)
     if len(tracks) < FEWEST:
-        return float("nan")
-    pair, k1 = _pair(tracks, T), 0.0
-    A = np.ones((len(tracks), 2))  # derivative of the residuals by k1 and by the shift
+        return Remaining(float("nan"), float("nan"))
+    k1 = _certain_k1(tracks, T, np.zeros((len(tracks), 0)))
+    if k1 == 0.0:
+        return Remaining(0.0, 0.0)
+    sheared = (tracks.right_px[0] - tracks.K_rights[0][:2, 2]) / tracks.K_rights[0][0, 0]
+    others = [_certain_k1(tracks, T, explained) for explained in (_by_rotation(tracks, T), sheared)]
+    alone = min((k1, *others), key=abs) if all(other * k1 > 0 for other in others) else 0.0
+    return Remaining(k1, alone)
+
+
+def _by_rotation(tracks: Tracks, T: np.ndarray) -> np.ndarray:
+    """Derivatives ``(N, 3)`` of the residuals by a turn of the right camera about each of its axes."""
+    columns = []
+    for axis in np.eye(3):
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_rotvec(STEP_TURN * axis).as_matrix()
+        ahead, behind = (epipolar(tracks, each @ T).off_px for each in (turn, turn.T))
+        columns.append((ahead - behind) / (2 * STEP_TURN))
+    return np.stack(columns, axis=1)
+
+
+def _certain_k1(tracks: Tracks, T: np.ndarray, explained: np.ndarray) -> float:
+    """The k1 that is certain beside other explanations, columns ``(N, M)`` of the residuals.
+
+    It minimises ``sum_i rho(e_i(k1) + c + b . a_i)``, with ``e_i`` the signed distance of match i from its
+    epipolar line when ``k1`` is removed from both pictures, ``c`` a shift across the lines, ``a_i`` the
+    match's row of the other explanations, and Cauchy's ``rho``; the estimate is moved towards 0 by
+    ``UNCERTAIN`` standard errors. The standard error is the larger of two: as if matches erred
+    independently, and as the sums over blocks of the left image show, since neighbours err alike.
+    """
+    pair, k1, others = _pair(tracks, T), 0.0, np.zeros(explained.shape[1])
+    # Derivatives of the residuals by k1, by the shift and by the others.
+    A = np.concatenate([np.ones((len(tracks), 2)), explained], axis=1)
     for _ in range(STEPS):
         off, ahead, behind = _residuals(pair, (k1, k1 + STEP_K1, k1 - STEP_K1))
         A[:, 0] = (ahead - behind) / (2 * STEP_K1)
-        centred = off - np.median(off)
+        centred = off - explained @ others
+        centred = centred - np.median(centred)
         scale = max(1.4826 * float(np.median(np.abs(centred))), 0.1)
         weight = 1.0 / (1.0 + (centred / (2.0 * scale)) ** 2)
         weighted = A * weight[:, None]
-        H = weighted.T @ A + 1e-9 * np.eye(2)
+        H = weighted.T @ A + 1e-9 * np.eye(A.shape[1])
         step = np.linalg.solve(H, weighted.T @ off)
-        k1 = float(np.clip(k1 - step[0], -MOST_K1, MOST_K1))
+        k1, others = float(np.clip(k1 - step[0], -MOST_K1, MOST_K1)), step[2:]
     inverse, pulls = np.linalg.inv(H), A * (weight * (off - A @ step))[:, None]
     error = max(scale * float(np.sqrt(inverse[0, 0])), _error_by_blocks(inverse, pulls, blocks(tracks)))
     return float(np.sign(k1)) * max(abs(k1) - UNCERTAIN * error, 0.0)
@@ -89,8 +121,8 @@ def remaining_distortion(tracks: Tracks, T: np.ndarray) -> float:
 def _error_by_blocks(inverse: np.ndarray, pulls: np.ndarray, block: np.ndarray) -> float:
     """Standard error of the first unknown where the matches of a block ``(N,)`` may err alike.
 
-    From the inverse ``(2, 2)`` of the normal equations' matrix, and what every match adds to their right
-    side at the minimum, ``pulls (N, 2)``.
+    From the inverse ``(M, M)`` of the normal equations' matrix, and what every match adds to their right
+    side at the minimum, ``pulls (N, M)``.
     """
     of_blocks = np.stack([np.bincount(block, pull) for pull in pulls.T], axis=1)
     return float(np.sqrt((inverse @ of_blocks.T @ of_blocks @ inverse)[0, 0]))

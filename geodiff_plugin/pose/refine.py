@@ -18,6 +18,7 @@ from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.pose.lens import remaining_distortion
 from geodiff_plugin.pose.mistakes import find_mistake, pose_change
 from geodiff_plugin.pose.solve import is_rig, nearby_poses, settle_poses
+from geodiff_plugin.pose.tearing import find_tear
 from geodiff_plugin.pose.tracks import (
     FEWEST,
     Tracks,
@@ -126,9 +127,9 @@ def refine_views(
     fits_px = FITS_PX if rig else POSED_FITS_PX
     fits = not (before > fits_px).any()
     near = given if fits else nearby_poses(sparse, given, before)
-    distortion = remaining_distortion(sparse.view(0), given[0])
-    behind = behind_infinity(sparse, given)
-    report = replace(report, behind_infinity=behind.share, behind_px=behind.px, distortion=distortion)
+    heights = [image.shape[-2] for image in (left_01, *(right.image_01 for right in rights))]
+    tear = find_tear([grey for grey, _ in views], heights)
+    report = _with_contradictions(replace(report, tear=tear), sparse, given)
     if mistakes := _messages(sparse, find_mistake, given, near):
         return tuple(rights), replace(report, status="mistaken", warnings=mistakes)
     if fits:
@@ -142,6 +143,18 @@ def refine_views(
         return tuple(rights), report
     sizes = [(image.shape[0], image.shape[1]) for image, _ in views[1:]]
     return _refined(_Misfit(rights, sizes, tracks, given, near, fits_px, rig, measured), report)
+
+
+def _with_contradictions(report: PoseReport, tracks: Tracks, given: np.ndarray) -> PoseReport:
+    """The report with what the matches say against the poses ``given (V, 4, 4)`` and the pictures."""
+    distortion, behind = remaining_distortion(tracks.view(0), given[0]), behind_infinity(tracks, given)
+    return replace(
+        report,
+        behind_infinity=behind.share,
+        behind_px=behind.px,
+        distortion=distortion.k1,
+        distortion_alone=distortion.alone,
+    )
 
 
 def _refined(misfit: _Misfit, report: PoseReport) -> _Refined:

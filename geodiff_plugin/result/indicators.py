@@ -140,11 +140,14 @@ def indicators_of(
         for name, residuals in (("epipolar_px", pose.residual_px), ("given_px", pose.residual_px_given)):
             known[name] = max((px for px in residuals if not math.isnan(px)), default=math.nan)
         known |= {"behind_infinity": pose.behind_infinity, "distortion": pose.distortion}
+        known |= {"distortion_alone": pose.distortion_alone, "tear": pose.tear}
         known["depth_spread"] = pose.depth_spread
         known["straightened_px"] = max(pose.straightened_px, default=0.0)
         if not math.isnan(pose.behind_px):  # a product would be another NaN, and verdicts would differ by it
             known["behind_px"] = pose.behind_px * pixels_of_matches(native.size)
         known["mistakes"] = tuple(m for m in pose.warnings if m.forbids_trust and m.code != INVERSE.code)
+    if rows := evidence.rows and evidence.rows.result():
+        known["shear"] = rows.shear * native.size[0] / native.size[1]  # pixels are square on its grid
     if native.views and has_unit:
         known["scale_spread"] = (pose and pose.scale_spread) or math.nan
     half_width = 0.5 * native.size[1]

@@ -31,6 +31,8 @@ USUAL_BEND_PX = 1.0
 USUAL_BEHIND = 0.04
 #: Radial coefficient k1 that right pairs seem to have.
 USUAL_DISTORTION = 0.08
+#: Shear of the right picture along its rows, in shares of its width, that right pairs seem to have.
+USUAL_SHEAR = 0.001
 #: Relative standard deviation of the scale of refined poses of right pairs.
 USUAL_SCALE = 0.06
 #: Change of log depth by another pose that fits a right pair as well.
@@ -54,8 +56,10 @@ def misfit_of(found: Indicators, size: tuple[int, int]) -> Misfit:
         _beyond(found.epipolar_px, USUAL_PX), _beyond(found.straightened_px, USUAL_BEND_PX)
     )
     behind_px = found.behind_px if found.behind_infinity > USUAL_BEHIND else 0.0
+    # Root mean square of a shift that grows from nothing at one edge of the picture.
+    sheared_px = abs(found.shear) * size[1] / math.sqrt(3.0) if abs(found.shear) > USUAL_SHEAR else 0.0
     return Misfit(
-        math.hypot(across_px * pixels_of_matches(size), behind_px),
+        math.hypot(across_px * pixels_of_matches(size), behind_px, sheared_px),
         0.0 if math.isnan(found.distortion) else max(0.0, abs(found.distortion) - USUAL_DISTORTION),
         math.hypot(_beyond(found.scale_spread, USUAL_SCALE), _beyond(found.depth_spread, USUAL_SPREAD)),
     )

@@ -183,7 +183,7 @@ def _rows_on(size: tuple[int, int], rows: RowMatches) -> RowMatches:
     if image_size(rows.shift) == size:
         return rows
     shift, matched, filled = F.interpolate(torch.stack(rows[:3])[None], size, mode="nearest-exact")[0]
-    return RowMatches(shift * (size[1] / rows.shift.shape[1]), matched, filled, rows.baseline_m)
+    return RowMatches(shift * (size[1] / rows.shift.shape[1]), matched, filled, rows.baseline_m, rows.shear)
 
 
 def _median_filtered(values: Tensor) -> Tensor:

@@ -45,6 +45,8 @@ def view_at(*centre: float) -> CameraView:
         ({"straightened_px": 1.25, "epipolar_px": 0.75}, SIZE, (math.hypot(0.75, 0.6), 0, 0)),
         ({"distortion": 0.081}, SIZE, (0, 0.001, 0)),
         ({"distortion": -0.25}, SIZE, (0, 0.17, 0)),
+        ({"shear": -0.03}, (480, 600), (18 / 3**0.5, 0, 0)),
+        ({"shear": 0.0009}, (480, 600), (0, 0, 0)),
         ({"scale_spread": 0.1}, SIZE, (0, 0, 0.08)),
         ({"depth_spread": 0.25}, SIZE, (0, 0, 0.2)),
         ({"scale_spread": 0.1, "depth_spread": 0.25}, SIZE, (0, 0, math.hypot(0.08, 0.2))),

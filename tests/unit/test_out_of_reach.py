@@ -83,10 +83,11 @@ BASELINE_M = 0.1
 
 def pair_of_shifts(*shifts_px: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Left and right picture of walls one above the other, and the pixels by which each row shifts."""
-    noise = np.random.default_rng(0).random((96, 168, 3), np.float32)
-    scene = cv2.GaussianBlur(noise, (0, 0), 1.0)
+    height = 96 // len(shifts_px)
+    walls = np.random.default_rng(0).random((len(shifts_px), height, 168, 3), np.float32)
+    scene = np.concatenate([cv2.GaussianBlur(wall, (0, 0), 1.0) for wall in walls])  # each of its own texture
     scene = (scene - scene.min()) / np.ptp(scene)
-    shifts = np.repeat(shifts_px, 96 // len(shifts_px))
+    shifts = np.repeat(shifts_px, height)
     right = np.stack([row[16 + px : 144 + px] for row, px in zip(scene, shifts, strict=True)])
     return scene[:, 16:144], right, shifts
 

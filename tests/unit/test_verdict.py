@@ -14,7 +14,7 @@ from geodiff_plugin.matching import Matches
 from geodiff_plugin.messages import Message
 from geodiff_plugin.result.confidence import Grounds, depth_confidence, grounds_of
 from geodiff_plugin.result.verdict import judge
-from geodiff_plugin.types import Indicators
+from geodiff_plugin.types import Indicators, Tear
 from tests.scenes import render_pair
 
 GOOD = Indicators(
@@ -154,6 +154,14 @@ def test_a_doubted_unit_is_not_trusted_unless_the_range_is_stated(signs, code):
         ({"distortion": -0.109}, None),
         ({"distortion": -0.111}, "views.distorted"),
         ({"distortion": math.nan}, None),
+        ({"distortion": -0.3, "distortion_alone": -0.111}, "views.distorted"),
+        ({"distortion": -0.3, "distortion_alone": -0.109}, "views.bent"),
+        ({"distortion": -0.109, "distortion_alone": 0.0}, None),
+        ({"tear": Tear(1, 160, -30)}, "views.torn"),
+        ({"tear": None}, None),
+        ({"shear": 0.0049}, None),
+        ({"shear": 0.0051}, "views.sheared"),
+        ({"shear": -0.0051}, "views.sheared"),
     ],
 )
 def test_what_the_matches_show_of_cameras_and_lenses(signs, code):
