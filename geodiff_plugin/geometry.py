@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from kornia.geometry.depth import unproject_meshgrid
 from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
@@ -46,7 +45,7 @@ def resize_intrinsics(K: Tensor, size_from: tuple[int, int], size_to: tuple[int,
         An integer is a pixel centre, so an image keeps its outer edges at -0.5 and ``W - 0.5``: ``cx =
         319.5`` of 640 columns becomes 159.5 of 320.
     """
-    before = K.detach().cpu().numpy()
+    before = K.numpy(force=True)
     scale = np.array([size_to[1] / size_from[1], size_to[0] / size_from[0], 1.0], before.dtype)
     half = np.array([0.5, 0.5, 0.0], before.dtype)
     resized = before * scale[:, None]
@@ -70,7 +69,7 @@ def as_fine_as(image_01: Tensor, K: Tensor, K_left: Tensor) -> tuple[Tensor, Ten
     them differently, and a rectified pair must stay rectified.
     """
     height, width = image_size(image_01)
-    focal_left, focal = (each.detach().cpu().numpy().diagonal() for each in (K_left, K))
+    focal_left, focal = (each.numpy(force=True).diagonal() for each in (K_left, K))
     columns, rows, _ = np.minimum(focal_left / focal, 1.0).tolist()
     return resize_image(image_01, K, (max(1, round(height * rows)), max(1, round(width * columns))))
 
@@ -81,7 +80,7 @@ def is_rectified(K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> 
     The rotation is the identity to 1e-3 an entry, ``|t_y|`` and ``|t_z|`` are below 1 % of ``|t_x|``, f
     agrees to 0.1 %, skew and cy to 0.1 % of f; cx may differ. Both K have as many pixels per radian.
     """
-    K, K_r, T = (each.detach().cpu().numpy() for each in (K_left, K_right, T_right_from_left))
+    K, K_r, T = (each.numpy(force=True) for each in (K_left, K_right, T_right_from_left))
     turned = np.abs(T[..., :3, :3] - np.eye(3, dtype=T.dtype)).max((-2, -1))
     t = np.abs(T[..., :3, 3])
     uneven = np.abs(K - K_r)[..., [0, 0, 1, 1], [0, 1, 1, 2]].max(-1)
@@ -121,14 +120,18 @@ def unproject(depth_m: Tensor, K: Tensor) -> Tensor:
         The pixel at the principal point has ``x = y = 0``; one focal length to its right has ``x = z``.
     """
     K = to_device_of(depth_m, K).to(depth_m.dtype)
-    return _rays(image_size(depth_m), K) * depth_m[:, 0, ..., None]
+    x, y = _rays(image_size(depth_m), K)
+    rays = torch.stack([x, y.expand_as(x), torch.ones_like(x)], dim=-1)
+    return rays * depth_m[:, 0, ..., None]
 
 
-def _rays(size: tuple[int, int], K: Tensor) -> Tensor:
-    """Points at z = 1 behind every pixel, ``(B, H, W, 3)``."""
-    rays = unproject_meshgrid(*size, K, device=K.device, dtype=K.dtype)
-    slant = (K[:, 0, 1] / K[:, 0, 0])[:, None, None]  # kornia's rays have no skew
-    return torch.cat([rays[..., :1] - (slant * rays[..., 1])[..., None], rays[..., 1:]], dim=-1)
+# kornia's ``unproject_meshgrid`` has no skew, and works on every pixel where a row or a column is enough.
+def _rays(size: tuple[int, int], K: Tensor) -> tuple[Tensor, Tensor]:
+    """``x (B, H, W)`` and ``y (B, H, 1)`` of the points at z = 1 behind every pixel."""
+    rows, columns = (torch.arange(count, device=K.device, dtype=K.dtype) for count in size)
+    fx, skew, cx, fy, cy = (K[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
+    y = (rows[:, None] - cy) / fy
+    return (columns - cx) / fx - skew / fx * y, y
 
 
 def transform(points: Tensor, T: Tensor) -> Tensor:
@@ -166,11 +169,12 @@ def plane_rays(
 
     Source: Eq. 25 (eq:forward-warp_supp), with the products of matrices taken once.
     """
-    x, y, _ = _rays(size, K_left).flatten(1, 2)[:, None].unbind(-1)  # (B, 1, H * W) each, at z = 1
+    x, y = _rays(size, K_left)
     M = K_right @ T_right_from_left[:, :3, :3]
+    by_x, by_y, rest = M[..., None].unbind(2)  # (B, 3, 1) each
     # Not a matrix product, which TF32 rounds by a quarter pixel.
-    infinity = M[..., 2:] + M[..., 1:2] * y + M[..., :1] * x
-    return PlaneRays(infinity, K_right @ T_right_from_left[:, :3, 3:])
+    infinity = (rest + by_y * y.mT)[..., None] + by_x[..., None] * x[:, None]
+    return PlaneRays(infinity.flatten(2), K_right @ T_right_from_left[:, :3, 3:])
 
 
 def rays_of(like: Tensor, K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> PlaneRays:

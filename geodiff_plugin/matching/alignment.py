@@ -81,7 +81,7 @@ def align_view(
     planes. The canvas covers the part of the right image on them, at most three left grids wide and high.
     """
     image, *matrices = right
-    K_r, T, K = (each.detach().cpu().numpy().astype(np.float64) for each in (*matrices, K_left))
+    K_r, T, K = (each.numpy(force=True).astype(np.float64) for each in (*matrices, K_left))
     R, w = T[:3, :3], inverse_depth.cpu().numpy().astype(np.float64)
     centre = R.T @ T[:3, 3]
     ratio = 1.0 + w * centre[2]  # depth in the turned view over depth in the left view

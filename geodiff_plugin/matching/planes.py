@@ -30,7 +30,7 @@ STEPS = 1 << 16
 
 
 def _matrix(matrix: Tensor) -> np.ndarray:
-    return matrix.detach().cpu().numpy().astype(np.float64)
+    return matrix.numpy(force=True).astype(np.float64)
 
 
 class Parallax:

@@ -111,7 +111,7 @@ def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: fl
     """
     levels = grey(torch.stack([left_01, view.image_01]))[:, 0] * 255.0
     images = list(levels.round().byte().cpu().numpy())
-    K, K_right, T = (each.detach().cpu().numpy() for each in (K_left, view.K, view.T_right_from_left))
+    K, K_right, T = (each.numpy(force=True) for each in (K_left, view.K, view.T_right_from_left))
     infinity = float(K[0, 2] - K_right[0, 2])
     mirrored = T[0, 3] > 0
     if mirrored:  # mirrored, a view to the left becomes one to the right

@@ -316,7 +316,7 @@ def straightened(image_01: Tensor, displacement: Displacement) -> Tensor:
 
 
 def _poses(rights: Sequence[CameraView]) -> np.ndarray:
-    return np.stack([T.detach().cpu().double().numpy() for _, _, T in rights])
+    return np.stack([T.numpy(force=True).astype(np.float64) for _, _, T in rights])
 
 
 def _as_E(Ts: np.ndarray) -> tuple[np.ndarray, ...]:

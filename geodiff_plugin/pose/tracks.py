@@ -287,7 +287,7 @@ def grey_image(image_01: Tensor, K_image: Tensor, factor: float) -> GreyImage:
     """A grey image shrunk by a factor <= 1."""
     pixels = image_01.detach().cpu().float().permute(1, 2, 0).contiguous().numpy()
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if pixels.shape[-1] == 3 else pixels[..., 0]
-    K = K_image.detach().cpu().double().numpy().copy()
+    K = K_image.numpy(force=True).astype(np.float64)
     height, width = grey.shape
     size = max(1, round(width * factor)), max(1, round(height * factor))
     if factor < 1.0:
@@ -305,7 +305,7 @@ def grey_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) ->
     """
     views = [grey_image(left_01, K_left, min(1.0, LONG_SIDE / max(left_01.shape[-2:])))]
     for image, K_right, _ in rights:
-        as_fine = float(views[0][1][0, 0] / K_right[0, 0])
+        as_fine = float(np.float32(views[0][1][0, 0]) / K_right.numpy(force=True)[0, 0])
         views.append(grey_image(image, K_right, min(1.0, as_fine, 2 * LONG_SIDE / max(image.shape[-2:]))))
     return views
 
