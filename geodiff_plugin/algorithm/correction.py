@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._kernels import launch_bound
+from geodiff_plugin._kernels import launch_bound, use_kernel
 from geodiff_plugin.algorithm.solver import RobustField, RobustSystem, solve_robust
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
 from geodiff_plugin.geometry import image_size
@@ -80,29 +80,34 @@ class _Observations(NamedTuple):
     """Matches against a map on their grid, ``(B, 1, h, w)`` each, and the links of that grid.
 
     ``residual`` is the log of a match's inverse depth over the map's, ``noise`` its standard deviation,
-    ``weight`` confidence over relative variance, ``correct_share (B, 1)`` the share of the weight that
-    correct matches are expected to have, ``links`` are across and down, at a smoothness of 1.
+    ``weight`` confidence over relative variance, ``links`` are across and down, at a smoothness of 1.
     """
 
     residual: Tensor
     noise: Tensor
     weight: Tensor
-    correct_share: Tensor
+    confidence: Tensor
     links: tuple[Tensor, Tensor]
 
 
 def _observations(depth_m: Tensor, target: Matches, left_01: Tensor, config: GuidanceConfig) -> _Observations:
-    size = target.size
-    guide = F.interpolate(left_01.float(), size, mode="bilinear", antialias=True)
-    log_depth = log_depth_at(depth_m, size)
+    guide = F.interpolate(left_01.float(), target.size, mode="bilinear", antialias=True)
+    log_depth = log_depth_at(depth_m, target.size)
+    residual, noise, weight = _residuals(log_depth, target, config.match_noise)
+    return _Observations(residual, noise, weight, target.confidence, edge_links(guide, log_depth))
+
+
+def _residuals(log_depth: Tensor, target: Matches, match_noise: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Residual, noise and weight of ``_Observations``."""
+    if use_kernel(log_depth):
+        from geodiff_plugin.algorithm import correction_kernels as kernels
+
+        return kernels.residuals(log_depth, target, match_noise)
     matched, step = target.inverse_depth.clamp_min(1e-9), target.plane_step.view(-1, 1, 1, 1)
-    noise = ((step / matched) ** 2 + config.match_noise**2).sqrt()
-    weight = target.confidence * (config.match_noise / noise) ** 2
+    noise = ((step / matched) ** 2 + match_noise**2).sqrt()
+    weight = target.confidence * (match_noise / noise) ** 2
     residual = torch.where(weight > 0, matched.log() + log_depth, torch.zeros_like(matched))
-    right = (weight * target.confidence.clamp_max(1.0)).flatten(1).sum(1, keepdim=True)
-    correct_share = right / weight.flatten(1).sum(1, keepdim=True).clamp_min(1e-9)
-    across, down = (edge_links(guide, log_depth, axis) for axis in (-1, -2))
-    return _Observations(residual, noise, weight, correct_share, (across, down))
+    return residual, noise, weight
 
 
 def log_depth_at(depth_m: Tensor, size: tuple[int, int]) -> Tensor:
@@ -110,11 +115,19 @@ def log_depth_at(depth_m: Tensor, size: tuple[int, int]) -> Tensor:
     return F.interpolate(depth_m.float().log(), size, mode="bilinear", align_corners=False)
 
 
-def edge_links(guide: Tensor, log_depth: Tensor, axis: int) -> Tensor:
-    """Strength with which neighbours along an axis share a correction, one per pair of them.
+def edge_links(guide: Tensor, log_depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Strength with which neighbours across and down share a correction, one per pair of them.
 
     ``guide (B, 3, h, w)`` and ``log_depth (B, 1, h, w)`` lie on one grid; it falls at the edges of both.
     """
+    if use_kernel(guide):
+        from geodiff_plugin.algorithm import correction_kernels as kernels
+
+        return kernels.edge_links(guide, log_depth)
+    return _links_along(-1, guide, log_depth), _links_along(-2, guide, log_depth)
+
+
+def _links_along(axis: int, guide: Tensor, log_depth: Tensor) -> Tensor:
     scale = max(guide.shape[-2:]) / REFERENCE_SIDE
     step = guide.diff(dim=axis).abs().mean(1, keepdim=True) / IMAGE_EDGE
     jump = log_depth.diff(dim=axis).abs() / DEPTH_EDGE
@@ -170,8 +183,13 @@ def off_edges(target: Matches, depth_m: Tensor, error: Tensor) -> Matches:
     size = target.size
     log_depth = log_depth_at(depth_m, size)
     reach = max(1, round(EDGE_REACH * max(size)))
+    error = _on_grid(error, size)
+    if use_kernel(log_depth):
+        from geodiff_plugin.algorithm import correction_kernels as kernels
+
+        return replace(target, confidence=kernels.off_edges(target.confidence, log_depth, error, reach))
     span = range_around(log_depth, reach)
-    width = EDGE_STEP * (_on_grid(error, size) / EDGE_ERROR).clamp_min(1.0) ** 3
+    width = EDGE_STEP * (error / EDGE_ERROR).clamp_min(1.0) ** 3
     return replace(target, confidence=target.confidence / (1.0 + (span / width) ** 2))
 
 
@@ -213,10 +231,17 @@ def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: Guid
 def _spread(residual: Tensor, observed: _Observations) -> Tensor:
     """``(B, 1, 1, 1)`` robust standard deviation of residuals, less their matches' noise, within bounds.
 
-    The largest residuals are left out, as many as matches are expected to be wrong. No match: ``MOST_ERROR``.
+    The largest residuals are left out, as many as matches are expected to be wrong by their confidence. No
+    match: ``MOST_ERROR``.
     """
+    if use_kernel(residual):
+        from geodiff_plugin.algorithm import correction_kernels as kernels
+
+        return kernels.spread(residual, observed.noise, observed.weight, observed.confidence)
     weight = observed.weight.flatten(1)
-    largest = weighted_quantile(residual.abs().flatten(1), weight, SHARE * observed.correct_share)
+    right = (observed.weight * observed.confidence.clamp_max(1.0)).flatten(1).sum(1, keepdim=True)
+    correct_share = right / weight.sum(1, keepdim=True).clamp_min(1e-9)
+    largest = weighted_quantile(residual.abs().flatten(1), weight, SHARE * correct_share)
     noise = weighted_quantile(observed.noise.flatten(1), weight, 0.5)
     beyond = ((largest / NORMAL_QUANTILE) ** 2 - noise**2 / 4.0).clamp_min(0.0).sqrt()
     beyond = torch.where(weight.sum(1) > 0, beyond, MOST_ERROR)
@@ -289,6 +314,10 @@ def fit_depth(
 
 def _levels(error: Tensor, config: GuidanceConfig) -> tuple[Tensor, Tensor]:
     """Smoothness and inertia ``(P, *error.shape)`` of all passes, from broad to that of the prior's error."""
+    if use_kernel(error):
+        from geodiff_plugin.algorithm import correction_kernels as kernels
+
+        return kernels.levels(error, config)
     ratio = REFERENCE_ERROR / error
     last = (config.smoothness * ratio**STIFFNESS_POWER).clamp(LOOSEST, STIFFEST)
     broad = last.clamp_min(BROAD_SMOOTHNESS)

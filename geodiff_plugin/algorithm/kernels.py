@@ -527,9 +527,11 @@ def _launch(read: _Read, written: tuple[Tensor, Tensor, Tensor], counts: _Counts
     )  # fmt: skip
 
 
-def _of_batch(part: Tensor, samples: int) -> Tensor:
+def _of_batch(part: Tensor, samples: int, axis: int = 0) -> Tensor:
     """A part of a system, contiguous, of so many samples."""
-    return (part if len(part) == samples else part.expand(samples, -1, -1, -1)).contiguous()
+    if part.shape[axis] != samples:
+        part = part.expand(*part.shape[:axis], samples, *part.shape[axis + 1 :])
+    return part.contiguous()
 
 
 def solve_field(system: FieldSystem, steps: int, start: Tensor | None) -> Tensor:
@@ -555,9 +557,7 @@ def solve_robust(system: RobustSystem, rounds: int, steps: int, with_support: bo
     parts, (across, down) = len(data), (_of_batch(link, len(data)) for link in system.links)
     field, weights = torch.empty_like(trusted), torch.empty_like(trusted)
     support = torch.empty_like(trusted) if with_support else None
-    stiffness, inertia = (
-        part.expand(-1, parts, -1, -1, -1).contiguous() for part in (system.smoothness, system.inertia)
-    )
+    stiffness, inertia = (_of_batch(part, parts, axis=1) for part in (system.smoothness, system.inertia))
     read = _Read(data, trusted, across, down, data, system.width.contiguous(), stiffness, inertia)
     local, channels = stiffness.shape[-2:] != (1, 1), 1 + with_support
     counts = _Counts(channels, len(stiffness), rounds, solver.COARSEST_STEPS, steps, False, local)

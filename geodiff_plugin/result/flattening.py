@@ -61,7 +61,7 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor) ->
     known = known_shape(target, torch.exp(-log_depth))
     guide = F.interpolate(left_01.float(), target.size, mode="bilinear", antialias=True)
     inverse = torch.exp(log_depth.mean() - log_depth)  # about 1, so that no weight depends on the unit
-    links = tuple(edge_links(guide, log_depth, axis) for axis in (-1, -2))
+    links = edge_links(guide, log_depth)
     least = LEAST_VALUE_WEIGHT * (WEAK_PRIOR / error).clamp_min(1.0) ** 4
     weight = (known**2 / (1.0 - known).clamp_min(1e-6) + least).clamp_max(MOST_VALUE_WEIGHT)
     pull = torch.zeros_like(inverse)

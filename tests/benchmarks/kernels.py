@@ -21,6 +21,7 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
+from geodiff_plugin.algorithm import correction_kernels as correction
 from geodiff_plugin.algorithm import edge_kernels
 from geodiff_plugin.algorithm import kernels as algorithm
 from geodiff_plugin.cli.terminal import new_table, show
@@ -58,6 +59,7 @@ def launches() -> Iterator[Compiled]:
     """Every kernel, at the largest sizes that are usual."""
     yield from _of_the_matching()
     yield from _of_the_solver()
+    yield from _of_the_fit()
     yield from _of_the_networks()
     yield from _of_the_scale()
     yield from _of_the_result()
@@ -153,6 +155,20 @@ def _of_the_solver() -> Iterator[Compiled]:
         sizes = {"ROBUST": robust, "TILE": algorithm.TILE, "ALONE": algorithm.ALONE}
         many = solve, sizes, algorithm.WARPS, options, algorithm.RESIDENT
         yield Compiled(name, algorithm.solve_kernel, *many)
+
+
+def _of_the_fit() -> Iterator[Compiled]:
+    block: dict[str, Any] = {"BLOCK": correction.BLOCK}
+    links = 4 * "*fp32 " + "i32 i32 fp32"
+    yield Compiled("links", correction.links_kernel, links, block | {"CHANNELS": 3}, 4)
+    observe = 7 * "*fp32 " + "i32 i32 fp32"
+    yield Compiled("residuals of matches", correction.observe_kernel, observe, block, 4)
+    sizes = {"CHUNK": correction.CHUNK}
+    spread = 5 * "*fp32 " + "i32 i32"
+    yield Compiled("spread of residuals", correction.spread_kernel, spread, sizes, correction.SPREAD_WARPS)
+    yield Compiled("levels of a fit", correction.levels_kernel, "*fp32 *fp32 *fp32 i32 fp32", block, 4)
+    edges = 4 * "*fp32 " + 4 * "i32 "
+    yield Compiled("matches off edges", correction.off_edges_kernel, edges, block, 4)
 
 
 def resources(launch: Compiled, architecture: int) -> tuple[int, int]:

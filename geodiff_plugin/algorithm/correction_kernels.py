@@ -1,0 +1,239 @@
+"""Triton kernels of the fit to matches beside its solver; their references are in ``algorithm.correction``.
+
+This module is imported only where ``use_kernel`` says so, because it imports Triton.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from geodiff_plugin._kernels import launched_on
+from geodiff_plugin.algorithm import correction
+from geodiff_plugin.config import GuidanceConfig
+from geodiff_plugin.matching import Matches
+from geodiff_plugin.scale.points import MOST_SORTED
+
+#: Pixels of a program.
+BLOCK = 512
+#: Matches that are counted at once.
+CHUNK = 2048
+#: Warps of the program that measures a spread.
+SPREAD_WARPS = 8
+# A kernel reads constants of its module only as these.
+_LEAST_LINK = tl.constexpr(correction.LEAST_LINK)
+_IMAGE_EDGE = tl.constexpr(correction.IMAGE_EDGE)
+_DEPTH_EDGE = tl.constexpr(correction.DEPTH_EDGE)
+_EDGE_STEP = tl.constexpr(correction.EDGE_STEP)
+_EDGE_ERROR = tl.constexpr(correction.EDGE_ERROR)
+_SHARE = tl.constexpr(correction.SHARE)
+_NORMAL_QUANTILE = tl.constexpr(correction.NORMAL_QUANTILE)
+_LEAST_ERROR = tl.constexpr(correction.LEAST_ERROR)
+_MOST_ERROR = tl.constexpr(correction.MOST_ERROR)
+_REFERENCE_ERROR = tl.constexpr(correction.REFERENCE_ERROR)
+_POWER = tl.constexpr(correction.STIFFNESS_POWER)
+_LOOSEST = tl.constexpr(correction.LOOSEST)
+_STIFFEST = tl.constexpr(correction.STIFFEST)
+_BROAD_SMOOTHNESS = tl.constexpr(correction.BROAD_SMOOTHNESS)
+_INERTIA = tl.constexpr(correction.INERTIA)
+_MOST_INERTIA = tl.constexpr(correction.MOST_INERTIA)
+_LOG_BROAD_INERTIA = tl.constexpr(math.log(correction.BROAD_INERTIA))
+_LOG_LEAST_INERTIA = tl.constexpr(math.log(correction.LEAST_INERTIA))
+_PASSES = tl.constexpr(correction.PASSES)
+#: Halvings that find a number among all floats from 0 on.
+_HALVINGS = tl.constexpr(32)
+#: The bits of infinity, as an integer.
+_BITS_OF_INFINITY = tl.constexpr(0x7F800000)
+
+
+@triton.jit
+def _link(guide, log_depth, p, away, here, n, scale, linked, CHANNELS: tl.constexpr):
+    """Links between pixels and those that lie ``away``."""
+    step = tl.zeros_like(here)
+    for channel in tl.static_range(CHANNELS):
+        of_channel = guide + channel * n + p
+        step += tl.abs(tl.load(of_channel + away, linked, 0.0) - tl.load(of_channel, linked, 0.0))
+    jump = tl.abs(tl.load(log_depth + p + away, linked, 0.0) - here) / _DEPTH_EDGE
+    unlike = step / CHANNELS / _IMAGE_EDGE + jump
+    return scale * scale * tl.maximum(tl.exp(-scale * unlike), _LEAST_LINK)
+
+
+@triton.jit(do_not_specialize=["height", "width"])
+def links_kernel(
+    guide, log_depth, across, down, height, width, scale, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
+):
+    """``edge_links``: a program makes those of a block of pixels to their right and lower neighbours."""
+    sample, n = tl.program_id(1), height * width
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    row = p // width
+    right, lower = (p < n) & (p - row * width < width - 1), p < n - width
+    guide += sample * CHANNELS * n
+    log_depth += sample * n
+    here = tl.load(log_depth + p, p < n, 0.0)
+    to_right = _link(guide, log_depth, p, 1, here, n, scale, right, CHANNELS)
+    tl.store(across + sample * (n - height) + p - row, to_right, right)
+    to_lower = _link(guide, log_depth, p, width, here, n, scale, lower, CHANNELS)
+    tl.store(down + sample * (n - width) + p, to_lower, lower)
+
+
+def edge_links(guide: Tensor, log_depth: Tensor) -> tuple[Tensor, Tensor]:
+    """``correction.edge_links`` by a kernel."""
+    batch, channels, height, width = guide.shape
+    across = log_depth.new_empty(batch, 1, height, width - 1)
+    down = log_depth.new_empty(batch, 1, height - 1, width)
+    launched_on(guide, links_kernel[(triton.cdiv(height * width, BLOCK), batch)])(
+        guide.contiguous(), log_depth.contiguous(), across, down, height, width,
+        max(height, width) / correction.REFERENCE_SIDE, CHANNELS=channels, BLOCK=BLOCK,
+    )  # fmt: skip
+    return across, down
+
+
+@triton.jit(do_not_specialize=["n", "steps"])
+def observe_kernel(
+    log_depth, matched, confidence, plane_step, residual, noise, weight, n, steps, match_noise,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``_residuals`` of a block of pixels."""
+    sample, p = tl.program_id(1), tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside, p = p < n, sample * n + p
+    inverse = tl.maximum(tl.load(matched + p, inside, 1.0), 1e-9)
+    relative = tl.load(plane_step + sample % steps) / inverse
+    deviation = tl.sqrt(relative * relative + match_noise * match_noise)
+    share = match_noise / deviation
+    counted = tl.load(confidence + p, inside, 0.0) * (share * share)
+    left_over = tl.where(counted > 0, tl.log(inverse) + tl.load(log_depth + p, inside, 0.0), 0.0)
+    tl.store(residual + p, left_over, inside)
+    tl.store(noise + p, deviation, inside)
+    tl.store(weight + p, counted, inside)
+
+
+def residuals(log_depth: Tensor, target: Matches, match_noise: float) -> tuple[Tensor, Tensor, Tensor]:
+    """``correction._residuals`` by a kernel."""
+    batch, n = len(log_depth), log_depth[0].numel()
+    residual, noise, weight = (torch.empty_like(log_depth) for _ in range(3))
+    launched_on(log_depth, observe_kernel[(triton.cdiv(n, BLOCK), batch)])(
+        log_depth, target.inverse_depth.contiguous(), target.confidence.contiguous(), target.plane_step,
+        residual, noise, weight, n, target.plane_step.numel(), match_noise, BLOCK=BLOCK,
+    )  # fmt: skip
+    return residual, noise, weight
+
+
+@triton.jit
+def _quantile(values, weight, share, n, every, CHUNK: tl.constexpr):
+    """``weighted_quantile`` of the sizes of values: exactly, as floats >= 0 have the order of their bits."""
+    count = tl.cdiv(n, every)
+    total = tl.zeros([CHUNK], tl.float32)
+    for first in range(0, count, CHUNK):
+        k = first + tl.arange(0, CHUNK)
+        total += tl.load(weight + k * every, k < count, 0.0)
+    wanted = share * tl.sum(total, 0)
+    below, reached = wanted.to(tl.int32) * 0 - 1, wanted.to(tl.int32) * 0 + _BITS_OF_INFINITY
+    for _ in range(_HALVINGS):
+        middle = below + (reached - below) // 2
+        total = tl.zeros([CHUNK], tl.float32)
+        some = tl.zeros([CHUNK], tl.int32)
+        for first in range(0, count, CHUNK):
+            k = first + tl.arange(0, CHUNK)
+            value = tl.abs(tl.load(values + k * every, k < count, 0.0)).to(tl.int32, bitcast=True)
+            under = (k < count) & (value <= middle)
+            total += tl.load(weight + k * every, under, 0.0)
+            some += under.to(tl.int32)
+        enough = (tl.sum(total, 0) >= wanted) & (tl.sum(some, 0) > 0)
+        below = tl.where(enough, below, middle)
+        reached = tl.where(enough & (middle > below), middle, reached)
+    return reached.to(tl.float32, bitcast=True)
+
+
+@triton.jit(do_not_specialize=["n", "every"])
+def spread_kernel(residual, noise, weight, confidence, spread, n, every, CHUNK: tl.constexpr):
+    """``_spread`` of a sample."""
+    sample = tl.program_id(0)
+    residual += sample * n
+    noise += sample * n
+    weight += sample * n
+    confidence += sample * n
+    known, right = tl.zeros([CHUNK], tl.float32), tl.zeros([CHUNK], tl.float32)
+    for first in range(0, n, CHUNK):
+        p = first + tl.arange(0, CHUNK)
+        counted = tl.load(weight + p, p < n, 0.0)
+        known += counted
+        right += counted * tl.minimum(tl.load(confidence + p, p < n, 0.0), 1.0)
+    weights = tl.sum(known, 0)
+    share = tl.sum(right, 0) / tl.maximum(weights, 1e-9) * _SHARE
+    largest = _quantile(residual, weight, share, n, every, CHUNK) / _NORMAL_QUANTILE
+    of_match = _quantile(noise, weight, 0.5, n, every, CHUNK)
+    beyond = tl.sqrt(tl.maximum(largest * largest - of_match * of_match / 4.0, 0.0))
+    beyond = tl.where(weights > 0, beyond, _MOST_ERROR)
+    tl.store(spread + sample, tl.minimum(tl.maximum(beyond, _LEAST_ERROR), _MOST_ERROR))
+
+
+def spread(residual: Tensor, noise: Tensor, weight: Tensor, confidence: Tensor) -> Tensor:
+    """``correction._spread`` by a kernel."""
+    found, n = residual.new_empty(len(residual), 1, 1, 1), residual[0].numel()
+    launched_on(residual, spread_kernel[(len(residual),)])(
+        residual.contiguous(), noise, weight, confidence.contiguous(), found, n, max(1, n // MOST_SORTED),
+        CHUNK=CHUNK, num_warps=SPREAD_WARPS,
+    )  # fmt: skip
+    return found
+
+
+@triton.jit(do_not_specialize=["count"])
+def levels_kernel(error, smoothness, inertia, count, reference_smoothness, BLOCK: tl.constexpr):
+    """``_levels`` of a block of errors."""
+    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    stiff = tl.exp(tl.log(tl.load(error + k, k < count, 1.0) / _REFERENCE_ERROR) * -_POWER)
+    last = tl.minimum(tl.maximum(reference_smoothness * stiff, _LOOSEST), _STIFFEST)
+    broad, held = tl.maximum(last, _BROAD_SMOOTHNESS), tl.minimum(stiff * _INERTIA, _MOST_INERTIA)
+    for turn in tl.static_range(_PASSES):
+        share = turn / (_PASSES - 1)
+        between = tl.exp(tl.log(broad) * (1.0 - share) + tl.log(last) * share)
+        least = (1.0 - share) * _LOG_BROAD_INERTIA + share * _LOG_LEAST_INERTIA
+        tl.store(smoothness + turn * count + k, between, k < count)
+        tl.store(inertia + turn * count + k, tl.maximum(held, tl.exp(held * 0.0 + least)), k < count)
+
+
+def levels(error: Tensor, config: GuidanceConfig) -> tuple[Tensor, Tensor]:
+    """``correction._levels`` by a kernel."""
+    smoothness, inertia = (error.new_empty(correction.PASSES, *error.shape) for _ in range(2))
+    count = error.numel()
+    launched_on(error, levels_kernel[(triton.cdiv(count, BLOCK),)])(
+        error.contiguous(), smoothness, inertia, count, config.smoothness, BLOCK=BLOCK
+    )
+    return smoothness, inertia
+
+
+@triton.jit(do_not_specialize=["height", "width", "reach", "local"])
+def off_edges_kernel(log_depth, confidence, error, out, height, width, reach, local, BLOCK: tl.constexpr):
+    """``off_edges`` of a block of pixels."""
+    sample, n = tl.program_id(1), height * width
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside, row, column = p < n, p // width, p % width
+    log_depth += sample * n
+    highest = tl.load(log_depth + p, inside, 0.0)
+    least = highest
+    for window in range((2 * reach + 1) * (2 * reach + 1)):
+        y = row + window // (2 * reach + 1) - reach
+        x = column + window % (2 * reach + 1) - reach
+        y, x = tl.minimum(tl.maximum(y, 0), height - 1), tl.minimum(tl.maximum(x, 0), width - 1)
+        value = tl.load(log_depth + y * width + x, inside, 0.0)
+        highest, least = tl.maximum(highest, value), tl.minimum(least, value)
+    of_prior = tl.load(error + sample * (1 + (n - 1) * local) + p * local, inside, 1.0)
+    factor = tl.maximum(of_prior / _EDGE_ERROR, 1.0)
+    ratio = (highest - least) / (factor * factor * factor * _EDGE_STEP)
+    found = tl.load(confidence + sample * n + p, inside, 0.0) / (1.0 + ratio * ratio)
+    tl.store(out + sample * n + p, found, inside)
+
+
+def off_edges(confidence: Tensor, log_depth: Tensor, error: Tensor, reach: int) -> Tensor:
+    """The confidence of ``correction.off_edges`` by a kernel; ``error`` is on the grid or one of a sample."""
+    (batch, _, height, width), found = log_depth.shape, torch.empty_like(log_depth)
+    local = error.shape[-2:] != (1, 1)
+    launched_on(log_depth, off_edges_kernel[(triton.cdiv(height * width, BLOCK), batch)])(
+        log_depth, confidence.contiguous(), error.expand(batch, -1, -1, -1).contiguous(), found,
+        height, width, reach, int(local), BLOCK=BLOCK,
+    )  # fmt: skip
+    return found
