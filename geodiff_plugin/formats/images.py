@@ -204,7 +204,7 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
         notes, (hwc, more) = [], _to_01(_hwc(value, name), name)
     for note in notes + more:
         warn(note, stacklevel=3)
-    return torch.from_numpy(hwc).permute(2, 0, 1).contiguous()  # by several threads, unlike numpy
+    return torch.from_numpy(np.ascontiguousarray(hwc.transpose(2, 0, 1)))
 
 
 def intrinsics_from_fov(fov_deg: float, size: tuple[int, int]) -> np.ndarray:
