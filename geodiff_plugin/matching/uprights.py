@@ -22,6 +22,8 @@ MOST_LEANING = 0.2
 BESIDE = 2
 #: Share of a line's pixels that must be matched.
 LEAST_MATCHED = 0.5
+#: Pixels of a line that must be matched.
+FEWEST_MATCHED = 8
 #: Shifts along a line scatter by less than this around a straight course, pixels.
 MOST_SCATTER_PX = 1.0
 #: Lines that say something together.
@@ -40,26 +42,40 @@ STEPS = 8
 MIDDLE_HALF, MEDIAN_OVER_MEAN = 1.349, 1.253
 
 
-class _Fit(NamedTuple):
-    """A straight course fitted to values: its slope, its value at the middle, residuals, and their scale."""
+class _Fits(NamedTuple):
+    """Straight courses fitted to rows of values ``(N, L)``."""
 
-    slope: float
-    middle: float
-    off: np.ndarray
-    scale: float
+    slope: np.ndarray  # (N,)
+    middle: np.ndarray  # (N,), the value at the mean place
+    off: np.ndarray  # (N, L), residuals
+    scale: np.ndarray  # (N,), their robust standard deviation
 
 
-def _fit_line(at: np.ndarray, values: np.ndarray) -> _Fit:
-    """``min sum_i rho(values_i - middle - slope (at_i - mean(at)))`` with Cauchy's ``rho``."""
-    A = np.stack([at - at.mean(), np.ones(len(at))], axis=1)
-    weight = np.ones(len(at))
+def _median(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """The median ``(N,)`` of the known values of every row ``(N, L)``, one at least."""
+    ordered, count = np.sort(np.where(known, values, np.inf), axis=1), known.sum(1)
+    row = np.arange(len(values))
+    return (ordered[row, (count - 1) // 2] + ordered[row, count // 2]) / 2.0
+
+
+def _fit_lines(at: np.ndarray, values: np.ndarray, known: np.ndarray) -> _Fits:
+    """``min sum_i rho(values_i - middle - slope (at_i - mean(at)))`` of every row, with Cauchy's ``rho``.
+
+    ``at`` and ``values (N, L)`` count where they are ``known (N, L)``, which they are somewhere in every row.
+    """
+    values = np.where(known, values, 0.0)
+    away = np.where(known, at - (at * known).sum(1, keepdims=True) / known.sum(1, keepdims=True), 0.0)
+    weight = known.astype(float)
     for _ in range(STEPS):
-        H = (A * weight[:, None]).T @ A + 1e-9 * np.eye(2)
-        slope, middle = np.linalg.solve(H, (A * weight[:, None]).T @ values)
-        off = values - A @ (slope, middle)
-        scale = max(1.4826 * float(np.median(np.abs(off))), 1e-6)
-        weight = 1.0 / (1.0 + (off / (2.0 * scale)) ** 2)
-    return _Fit(float(slope), float(middle), off, scale)
+        total, first, second = weight.sum(1), (weight * away).sum(1), (weight * away**2).sum(1)
+        sums, moments = (weight * values).sum(1), (weight * away * values).sum(1)
+        determinant = np.maximum(total * second - first**2, 1e-9)
+        slope = (total * moments - first * sums) / determinant
+        middle = (second * sums - first * moments) / determinant
+        off = values - middle[:, None] - slope[:, None] * away
+        scale = np.maximum(1.4826 * _median(np.abs(off), known), 1e-6)
+        weight = known / (1.0 + (off / (2.0 * scale[:, None])) ** 2)
+    return _Fits(slope, middle, off, scale)
 
 
 def _upright_lines(grey: np.ndarray) -> np.ndarray:
@@ -70,20 +86,28 @@ def _upright_lines(grey: np.ndarray) -> np.ndarray:
     return lines[(down > SHORTEST * len(grey)) & (along < MOST_LEANING * down)]
 
 
-def _course(line: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> _Fit | None:
-    """How the shift changes along a line; ``None`` where it is hardly matched or not straight."""
+class _Along(NamedTuple):
+    """What is matched along lines, ``(N, L)`` each; a line has a sample a row, the longest has ``L``."""
+
+    row: np.ndarray  # of the picture
+    shift: np.ndarray
+    known: np.ndarray  # bool, where a line has a sample and this is matched
+    share: np.ndarray  # (N,) of the samples of a line that are known
+
+
+def _along(lines: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> _Along:
+    """The samples along lines ``(N, 4)``, one at least."""
     height, width = shift.shape
-    x0, v0, x1, v1 = line
-    t = np.linspace(0.05, 0.95, max(8, int(abs(v1 - v0))))
+    x0, v0, x1, v1 = lines.T[:, :, None]
+    count = np.maximum(8, np.abs(v1 - v0).astype(int))  # (N, 1)
+    k = np.arange(count.max())
+    t = 0.05 + 0.9 * k / (count - 1)
     rows = np.clip(np.rint(v0 + (v1 - v0) * t).astype(int), 0, height - 1)
     columns = np.rint(x0 + (x1 - x0) * t).astype(int)
-    columns = np.clip(columns + np.arange(-BESIDE, BESIDE + 1)[:, None], 0, width - 1)
+    columns = np.clip(columns + np.arange(-BESIDE, BESIDE + 1)[:, None, None], 0, width - 1)
     of_line = np.where(matched[rows, columns] > 0, shift[rows, columns], -np.inf).max(0)
-    known = np.isfinite(of_line)
-    if known.sum() < 8 or known.mean() < LEAST_MATCHED:
-        return None
-    fit = _fit_line(rows[known].astype(float), of_line[known].astype(float))
-    return fit if fit.scale < MOST_SCATTER_PX else None
+    known = np.isfinite(of_line) & (k < count)
+    return _Along(rows.astype(float), of_line.astype(float), known, known.sum(1) / count[:, 0])
 
 
 def certain_shear(grey: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> float:
@@ -102,20 +126,24 @@ def certain_shear(grey: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> f
         0 where nothing is certain, NaN where too few lines are matched.
     """
     lines = _upright_lines(grey)
-    courses = [_course(line, shift, matched) for line in lines]
-    kept = np.array([course is not None for course in courses], bool)
-    if kept.sum() < FEWEST_LINES:
+    if len(lines) < FEWEST_LINES:
         return math.nan
-    x = (lines[kept, 0] + lines[kept, 2]) / 2
-    if x.std() < LEAST_SPREAD * grey.shape[1]:
+    along = _along(lines, shift, matched)
+    enough = (along.known.sum(1) >= FEWEST_MATCHED) & (along.share >= LEAST_MATCHED)
+    if enough.sum() < FEWEST_LINES:
         return math.nan
-    slopes = (lines[kept, 2] - lines[kept, 0]) / (lines[kept, 3] - lines[kept, 1])
-    meeting = _fit_line(x, slopes)
-    parallel = np.abs(meeting.off) < MOST_OFF * max(meeting.scale, EXACT)
+    lines, courses = lines[enough], _fit_lines(along.row[enough], along.shift[enough], along.known[enough])
+    straight = courses.scale < MOST_SCATTER_PX
+    x = (lines[straight, 0] + lines[straight, 2]) / 2
+    if straight.sum() < FEWEST_LINES or x.std() < LEAST_SPREAD * grey.shape[1]:
+        return math.nan
+    slopes = (lines[straight, 2] - lines[straight, 0]) / (lines[straight, 3] - lines[straight, 1])
+    meeting = _fit_lines(x[None], slopes[None], np.ones((1, len(x)), bool))
+    parallel = np.abs(meeting.off[0]) < MOST_OFF * max(float(meeting.scale[0]), EXACT)
     if parallel.sum() < FEWEST_LINES:
         return math.nan
-    flat = np.array([course.slope for course in courses if course is not None])[parallel]
-    pitch = np.array([meeting.slope * course.middle for course in courses if course is not None])[parallel]
+    flat = courses.slope[straight][parallel]
+    pitch = float(meeting.slope[0]) * courses.middle[straight][parallel]
     certain = [_certain_median(flat), _certain_median(flat - pitch)]
     return min(certain, key=abs) if certain[0] * certain[1] > 0 else 0.0
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from geodiff_plugin.types import Tear
 
@@ -68,19 +69,20 @@ def _shift(above: np.ndarray, below: np.ndarray) -> tuple[float, int]:
     most = int(MOST_SHIFT * width)
     part = np.arange(width) * PARTS // width
     unmoved = np.bincount(part, np.abs(above - below), PARTS) / np.bincount(part, minlength=PARTS)
-    totals, of_parts = [], []
-    for shift in range(-most, most + 1):
-        at = slice(max(0, shift), width + min(0, shift))
-        off = np.abs(below[at] - above[max(0, -shift) : width + min(0, -shift)])
-        totals.append(off.mean())
-        count = np.maximum(np.bincount(part[at], minlength=PARTS), 1)
-        of_parts.append(np.bincount(part[at], off, PARTS) / count)
+    # Row k: what lies ``most - k`` pixels to the right of every pixel above; NaN beyond the ends.
+    beside = sliding_window_view(np.pad(above, most, constant_values=np.nan), width)
+    off = np.abs(below - beside[::-1])  # (2 most + 1, W), of every shift from -most to most
+    known = ~np.isnan(off)
+    off[~known] = 0.0
+    totals = off.sum(1) / known.sum(1)
     best = int(np.argmin(totals))
+    count = np.maximum(np.bincount(part, known[best], PARTS), 1.0)
+    of_parts = np.bincount(part, off[best], PARTS) / count
     textured = unmoved > TEXTURED
-    alike = (of_parts[best] < MORE_ALIKE * unmoved) & textured
+    alike = (of_parts < MORE_ALIKE * unmoved) & textured
     agree = textured.sum() >= FEWEST_TEXTURED and alike.sum() >= AGREEING * textured.sum()
-    known = agree and 0 < best < 2 * most
-    return float(totals[most] / max(totals[best], 0.5)) if known else 0.0, best - most
+    is_clear = agree and 0 < best < 2 * most
+    return float(totals[most] / max(totals[best], 0.5)) if is_clear else 0.0, best - most
 
 
 def find_tear(greys: Sequence[np.ndarray], heights: Sequence[int]) -> Tear | None:

@@ -323,7 +323,8 @@ def sift_features(
     if not points:
         return np.zeros((0, 4)), np.zeros((0, 128), np.float32)
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-7))
-    return np.array([(*p.pt, p.size, p.angle) for p in points], np.float64), root.astype(np.float32)
+    size, angle = [p.size for p in points], [p.angle for p in points]
+    return np.c_[cv2.KeyPoint.convert(points), size, angle].astype(np.float64), root.astype(np.float32)
 
 
 def match_features(left: tuple[np.ndarray, np.ndarray], right: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
