@@ -268,10 +268,11 @@ def waits(bench: Bench) -> Iterator[Row]:
 
 
 def bundled(bench: Bench) -> Iterator[Row]:
-    """The bundled prior in float32."""
+    """The bundled prior in float32; a plain call of it takes one step, a guided one four."""
     pipe = bench.bundled(bench.device)
     guided = functools.partial(_guided, pipe, bench.pair)
     calls = {"plain": functools.partial(_plain, pipe, bench.pair), "guided": guided}
+    calls |= {"guided, graphs": _graphed(pipe, guided, is_plain=False)}
     yield from bench.rows(calls | {"guided, without kernels": _referred(guided)})
 
 
