@@ -43,7 +43,7 @@ CAPTURES = ("tests/parity/test_capture_references.py",)
 MUTANTS = [
     *of(
         "geometry.py",
-        ("centre = (K[:, :, 2] + half) * scale - half", "centre = K[:, :, 2] * scale"),
+        ("(before[:, :, 2] + half) * scale - half", "before[:, :, 2] * scale"),
         (
             "size_to[1] / size_from[1], size_to[0] / size_from[0]",
             "size_to[0] / size_from[0], size_to[1] / size_from[1]",
@@ -51,12 +51,12 @@ MUTANTS = [
         ("align_corners=False, antialias=True)[0]", "align_corners=False)[0]"),
         ("[0, 0, 1, 1], [0, 1, 1, 2]", "[0, 0, 1], [0, 1, 1]"),
         ("sideways = t[..., 1:]", "sideways = t[..., 1:2]"),
-        ("K[i, i])) for i in (1, 0)", "K[i, i])) for i in (0, 1)"),
+        ("columns, rows, _ = np.minimum", "rows, columns, _ = np.minimum"),
         ("SIDEWAYS_TOLERANCE = 0.01", "SIDEWAYS_TOLERANCE = 0.02"),
     ),
     *of(
         "geometry.py",
-        ("rays[..., :1] - (slant", "rays[..., :1] + (slant"),
+        ("/ fx - skew / fx * y", "/ fx + skew / fx * y"),
         ("in_front = z > NEAREST_M", "in_front = z.abs() > NEAREST_M"),
         ("M = K_right @ T_right_from_left[:, :3, :3]", "M = K_left @ T_right_from_left[:, :3, :3]"),
         ("fx * x + skew * y + cx", "fx * x + cx"),
@@ -433,13 +433,13 @@ MUTANTS = [
     *of(
         "pose/tracks.py",
         ("K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5", "K[:2, 2] = K[:2, 2] * scale"),
-        ("views[0][1][0, 0] / K_right[0, 0]", "K_right[0, 0] / views[0][1][0, 0]"),
-        ("(inverse_depth < 0) & (away", "(inverse_depth > 0) & (away"),
+        ("np.float32(views[0][1][0, 0]) /", "1 / np.float32(views[0][1][0, 0]) *"),
+        ("(at.inverse_depth < 0) & (away", "(at.inverse_depth > 0) & (away"),
         tests=(*CAPTURES, f"{UNIT}pose_refine.py"),
     ),
     *of(
         "pose/lens.py",
-        ("np.c_[(ahead - behind)", "np.c_[(behind - ahead)"),
+        ("A[:, 0] = (ahead - behind)", "A[:, 0] = (behind - ahead)"),
         ("abs(k1) - UNCERTAIN * error", "abs(k1) + UNCERTAIN * error"),
         (", _error_by_blocks(inverse, pulls, blocks(tracks)))", ", 0.0)"),
         tests=(f"{UNIT}pose_refine.py",),
