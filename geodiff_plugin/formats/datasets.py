@@ -43,9 +43,14 @@ GROUND_TRUTHS = ("state_groundtruth_estimate0", "mocap0", "gt0", "leica0")
 def read_euroc(path: Path) -> Layout | None:
     """cam0 of a sequence in ASL's layout, by the body's poses and ``T_BS``; the other camera is left out."""
     for folder in (path, path / "mav0"):
+        if not all((folder / "cam0" / name).is_file() for name in ("data.csv", "sensor.yaml")):
+            continue
         truth = next((t for name in GROUND_TRUTHS if (t := folder / name / "data.csv").is_file()), None)
-        if truth and all((folder / "cam0" / name).is_file() for name in ("data.csv", "sensor.yaml")):
-            return _euroc(folder, truth)
+        if truth is None:
+            expected = f"with ground truth ({' or '.join(f'{name}/data.csv' for name in GROUND_TRUTHS)})"
+            cure = f"Give {folder / 'cam0' / 'data'} with --K to solve for the poses."
+            bad_value("a sequence of EuRoC", expected, f"{folder} without", cure)
+        return _euroc(folder, truth)
     return None
 
 

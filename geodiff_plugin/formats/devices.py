@@ -5,6 +5,7 @@ from __future__ import annotations
 import configparser
 import json
 import re
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,10 @@ RS_INTRINSIC = re.compile(
 RS_EXTRINSIC = re.compile(
     r'^\s*Extrinsic from "Infrared 1"\s+To\s+"Infrared 2"[^\n]*\n(.*?)(?=\n\s*Extrinsic|\Z)', re.M | re.S
 )
+#: Names of what is not of the infrared pair, in small letters; the depth map is of its left camera.
+RS_OTHERS = re.compile(r"colou?r|rgb|depth|gyro|accel|imu|confidence")
+#: What the baseline is called, in metres.
+RS_BASELINES = ("baseline", "baseline_m", "baseline_meters", "baseline_metres")
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 #: CAM_B and CAM_C, an OAK-D's left and right camera.
 OAK_PAIR = (1, 2)
@@ -103,19 +108,44 @@ def _rs_printed(text: str, choice: CameraChoice) -> tuple[Camera, Camera, np.nda
 
 
 def _rs_json(text: str) -> tuple[Camera, Camera, np.ndarray]:
-    """Of ``rs2_intrinsics``, left before right, and ``rs2_extrinsics`` between them, under any names."""
-    objects = list[Entries]()
-    json.loads(text, object_hook=objects.append)
-    views = [values for values in objects if "ppx" in values]
-    between = [values for values in objects if "translation" in values]
-    if len(views) != 2 or len(between) != 1:
+    """Of ``rs2_intrinsics``, left before right, and ``rs2_extrinsics`` between them, under any names.
+
+    Other cameras are left out where their names say which those of the pair are. Instead of extrinsics there
+    may be a baseline in metres.
+    """
+    data = json.loads(text)
+    found = list(_rs_objects(data, ""))
+    views = _of_pair([(name, values) for name, values in found if "ppx" in values], 2)
+    between = _of_pair([(name, values) for name, values in found if "translation" in values], 1)
+    baseline = next((data[name] for name in RS_BASELINES if isinstance(data, dict) and name in data), None)
+    if len(views) != 2 or len(between) != 1 and (between or baseline is None):
         expected = "two rs2 intrinsics (fx, fy, ppx, ppy), of the infrared pair, and their extrinsics alone"
-        bad_value("the file", expected, f"{len(views)} and {len(between)}", "Is the file cut off?")
+        cure = "Keep those of the infrared pair; their baseline in metres does for the extrinsics."
+        bad_value("the file", expected, f"{len(views)} and {len(between)}", cure)
+    if not between:
+        T = transform(np.eye(3), (-array_of(baseline, (), "the baseline"), 0, 0), "the baseline")
+        return _rs_camera(views[0]), _rs_camera(views[1]), T
     # rs2 keeps a rotation column by column.
     R = array_of(between[0]["rotation"], (3, 3), "the rotation of the extrinsics").T
     T = transform(R, between[0]["translation"], "the extrinsics")
     # From the left to the right one x becomes smaller; a file that says it the other way round is inverted.
     return _rs_camera(views[0]), _rs_camera(views[1]), T if T[0, 3] <= 0 else np.linalg.inv(T)
+
+
+def _rs_objects(data: Any, name: str) -> Iterator[tuple[str, Entries]]:
+    """Every object of a JSON value, in order, with the names that lead to it."""
+    if isinstance(data, dict):
+        yield name, data
+    pairs = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    for key, value in pairs:
+        yield from _rs_objects(value, f"{name}.{key}".lower())
+
+
+def _of_pair(named: list[tuple[str, Entries]], count: int) -> list[Entries]:
+    """Of more than ``count`` objects those that do not belong to another camera by their names."""
+    if len(named) > count:
+        named = [(name, values) for name, values in named if not RS_OTHERS.search(name)]
+    return [values for _, values in named]
 
 
 def read_realsense(texts: tuple[str, ...], choice: CameraChoice) -> Rig:

@@ -59,6 +59,16 @@ FOREIGN_CALIBRATIONS = (
         "a reconstruction of many images",
         "Give it to geodiff capture.",
     ),
+    ForeignCalibration(
+        r"^\s*camRect\d+\s*:|^\s*disparity_to_depth\s*:",
+        "a cam_to_cam.yaml of DSEC",
+        "Give --fx --fy --cx --cy of the pair's camRect, and as --baseline 1 / Q[3][2] of its Q.",
+    ),
+    ForeignCalibration(
+        r"^camera\.A\s*=\s*\[",
+        "parameters of an rc_visard or of cvkit",
+        "Give --fx --fy --cx --cy of its camera.A, and its t as --baseline.",
+    ),
     ForeignCalibration(r'"vehicle_SE3_camera_"', "a calibration of Argoverse", ONE_CAMERA),
     ForeignCalibration(r'\A\s*\{(?=[\s\S]*"intrinsic_matrix")', "a camera of Open3D", ONE_CAMERA),
 )

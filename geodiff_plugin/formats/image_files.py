@@ -27,7 +27,11 @@ LEAST_FOUND = 0.5
 #: Beginnings of the names of folders whose pictures are no photographs, but have their names.
 NO_PHOTOGRAPHS = ("depth", "mask", "normal", "seg", "label", "conf", "thumb", ".")
 #: Files and folders of a capture of its own, whose images are other ones, or the same without distortion.
-OTHER_CAMERAS = ("sparse", "transforms.json", "transforms_train.json", "cameras.txt", "cameras.bin")
+OTHER_CAMERAS = (
+    *("sparse", "transforms.json", "transforms_train.json", "cameras.txt", "cameras.bin", "cameras.xml"),
+    *("reconstruction.json", "bundle.out", "metadata.json", "keyframes", "odometry.csv", "groundtruth.txt"),
+    *("traj.txt", "poses.txt", "calib.txt", "cam0", "report.json"),
+)
 
 
 def images_of(paths: Iterable[Path]) -> list[Path]:
@@ -54,6 +58,12 @@ def find_images(names: Sequence[str], folders: Sequence[Path]) -> list[Path | No
     """
     finder = _Finder(folders)
     return _claimed_once([finder.find(name) for name in names])
+
+
+def is_any_there(names: Sequence[str], folders: Sequence[Path]) -> bool:
+    """Whether there is a file that any of the names could mean, though it may mean none alone."""
+    finder = _Finder(folders)
+    return any(finder.find(name).path is not None for name in names)
 
 
 def _claimed_once(found: Sequence[_Found]) -> list[Path | None]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin._checks import InputError, bad_value
-from geodiff_plugin.formats.image_files import LEVELS_UP, find_images, find_moved
+from geodiff_plugin.formats.image_files import LEVELS_UP, find_images, find_moved, is_any_there
 from geodiff_plugin.formats.rigs import Camera
 from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Distortion
@@ -114,7 +114,7 @@ class Images:
         places = [os.path.relpath(folder, below) for folder in folders]
         searched = ", ".join("its folder" if at == "." else at for at in places)
         self._problem = f"{NO_IMAGE} in {searched}"
-        if once and not any(files):
+        if once and not any(files) and not is_any_there(once, folders):
             levels = LEVELS_UP if given is None else 0
             moved = find_moved(once, folders[0], levels, other)
             if moved is None:

@@ -127,7 +127,9 @@ def read_opensfm(path: Path, images_at: Path | None = None) -> Layout | None:
     """OpenSfM's ``reconstruction.json``, its largest part; poses are world-to-camera."""
     for file in _files(path, "*reconstruction*.json", "opensfm/reconstruction.json"):
         data = json.loads(read_text(file, "PATH"))
-        if isinstance(data, list) and data and all("shots" in each and "cameras" in each for each in data):
+        if data == []:
+            bad_value("reconstruction.json", "with images that were placed", f"{file} with none")
+        if isinstance(data, list) and all("shots" in each and "cameras" in each for each in data):
             return _opensfm(file, data, images_at)
     return None
 

@@ -160,7 +160,27 @@ def read_euroc(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 def _projection(info: Entries) -> np.ndarray:
     """``P`` of a file of ``camera_calibration``, or of the message as ROS 1 or ROS 2 prints it."""
     matrix = next((info[name] for name in ("projection_matrix", "P", "p") if name in info), None)
-    return array_of(matrix.get("data") if isinstance(matrix, dict) else matrix, (3, 4), "projection_matrix")
+    data = matrix.get("data") if isinstance(matrix, dict) else matrix
+    return _of_window(info) @ array_of(data, (3, 4), "projection_matrix")
+
+
+def _of_window(info: Entries) -> np.ndarray:
+    """``(3, 3)`` from pixels of the whole sensor, which K and P are in, to those of the region of interest.
+
+    Source: ``fromCameraInfo`` of ``image_geometry/pinhole_camera_model.cpp`` (ros-perception/vision_opencv).
+    """
+    roi = info.get("roi") or {}
+    shift = np.eye(3)
+    shift[:2, 2] = array_of([-roi.get("x_offset", 0), -roi.get("y_offset", 0)], (2,), "roi")
+    return shift
+
+
+def _window_size(info: Entries) -> tuple[Any, Any]:
+    """Width and height of the images before binning: of the region of interest, where one is set."""
+    roi = info.get("roi") or {}
+    sides = (("width", "image_width"), ("height", "image_height"))
+    width, height = (roi.get(side) or info.get(whole, info.get(side)) for side, whole in sides)
+    return width, height
 
 
 def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
@@ -169,7 +189,7 @@ def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     Those that say ``rectified: false`` (``recordings.stereo_calibration``) stand for the images as taken.
     """
     infos = [read_yaml(text) for text in texts]
-    sizes = [(i.get("image_width", i.get("width")), i.get("image_height", i.get("height"))) for i in infos]
+    sizes = [_window_size(info) for info in infos]
     rig = projected(*map(_projection, infos), *sizes)
     if not rig.E[:3, 3].any():
         expected = "-fx * baseline in the right camera's file"
@@ -179,7 +199,12 @@ def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         return rig
     left, right = (transform(info["R"], (0, 0, 0), "R") for info in infos)
     cameras = [
-        Camera(info["K"], size, info["D"], str(info["distortion_model"]))
+        Camera(
+            _of_window(info) @ array_of(info["K"], (3, 3), "K"),
+            size,
+            info["D"],
+            str(info["distortion_model"]),
+        )
         for info, size in zip(infos, sizes, strict=True)
     ]
     return make_rig(cameras[0], cameras[1], np.linalg.inv(left) @ rig.E @ right)

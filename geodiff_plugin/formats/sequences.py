@@ -29,6 +29,8 @@ from geodiff_plugin.formats.recordings import is_video, video_facts
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, reading_whole, rigid
 from geodiff_plugin.messages import Message
 
+#: TUM's ``associate.py`` and those that run on its files write a line an image and its depth map.
+TUM_ASSOCIATIONS = ("associations.txt", "associated.txt", "association.txt")
 SEVEN_SCENES = Camera(intrinsics(525.0, 525.0, 320.0, 240.0), (640, 480))
 TUM_RGBD = Camera(intrinsics(525.0, 525.0, 319.5, 239.5), (640, 480))
 
@@ -166,12 +168,17 @@ def read_replica(folder: Path) -> Layout | None:
 
 def read_tum(folder: Path) -> Layout | None:
     """TUM RGB-D: poses and depth maps by the time of each image."""
-    if not ((folder / "rgb.txt").is_file() and (folder / "groundtruth.txt").is_file()):
+    associations = next((file for name in TUM_ASSOCIATIONS if (file := folder / name).is_file()), None)
+    if not ((folder / "rgb.txt").is_file() or associations) or not (folder / "groundtruth.txt").is_file():
         return None
     camera, candidates = _file_camera(folder, TUM_RGBD), list[Candidate]()
     pose_at = read_trajectory(folder / "groundtruth.txt")
-    depths = _timed_names(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
-    for t, name in _timed_names(folder / "rgb.txt"):
+    if associations is not None and not (folder / "rgb.txt").is_file():
+        images, depths = _associated_names(associations)
+    else:
+        images = _timed_names(folder / "rgb.txt")
+        depths = _timed_names(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
+    for t, name in images:
         near, depth_name = min(depths, key=lambda depth: abs(depth[0] - t), default=(np.inf, ""))
         depth = folder / depth_name if abs(near - t) < FARTHEST_S else None
         frame = CaptureFrame(Path(name).stem, folder / name, pose_at(t), depth, TUM_DEPTH)
@@ -182,6 +189,16 @@ def read_tum(folder: Path) -> Layout | None:
 def _timed_names(file: Path) -> list[tuple[float, str]]:
     with reading_whole(file, "list of seconds and file names"):
         return [(float(t), name) for t, name, *_ in read_rows(file, f"{file}", "seconds and file names")]
+
+
+def _associated_names(file: Path) -> tuple[list[tuple[float, str]], list[tuple[float, str]]]:
+    """Images and depth maps with their seconds, of lines that have one of each, in either order."""
+    with reading_whole(file, "list of seconds and file names, twice a line"):
+        rows = [row[:4] for row in read_rows(file, f"{file}", "seconds and file names")]
+        pairs = [((float(t), name), (float(s), other)) for t, name, s, other in rows]
+    depth_first = any(Path(name).parent.name.startswith("depth") for (_, name), _ in pairs)
+    first, second = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+    return (second, first) if depth_first else (first, second)
 
 
 def read_trajectory(file: Path) -> PoseAt:

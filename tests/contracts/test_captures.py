@@ -15,6 +15,7 @@ from tests.contracts.captures import (
     TRUE,
     WRITERS,
     Twin,
+    euroc,
     kitti_odometry,
     log,
     metashape,
@@ -126,6 +127,17 @@ def test_visualsfm_straightens_by_its_own_formula(tmp_path):
     focal, centre = CENTRAL[0, 0], CENTRAL[:2, 2]
     straight = undistorted_pixels(focal * m + centre, frame.K, frame.lens)
     np.testing.assert_allclose(straight, focal * rays + centre, atol=0.02)
+
+
+def test_what_has_cameras_but_no_poses_says_so(tmp_path):
+    sequence = euroc(tmp_path / "euroc").path
+    for truth in sequence.rglob("state_groundtruth*"):
+        shutil.rmtree(truth)
+    with pytest.raises(InputError, match=r"EuRoC must be with ground truth.*cam0/data with --K"):
+        opened(Twin(sequence))
+    (tmp_path / "reconstruction.json").write_text("[]")
+    with pytest.raises(InputError, match="images that were placed"):
+        opened(Twin(tmp_path))
 
 
 @pytest.mark.parametrize("foreign", FOREIGN, ids=lambda each: each.marks[0])

@@ -1,6 +1,7 @@
 """Readers of captures: every layout gives the same frames, and bad input a sentence."""
 
 import json
+import shutil
 import warnings
 from pathlib import Path
 
@@ -117,6 +118,25 @@ def test_binary_models_are_calibrations_and_a_cut_off_file_is_named(tmp_path, na
     path.write_bytes(path.read_bytes()[:-3])
     with pytest.raises(InputError, match=rf"{name} must be a binary COLMAP file; got less.*cut off"):
         Capture.open(tmp_path)
+
+
+@pytest.mark.parametrize("line", ["{t} rgb/{i}.png {t} depth/{i}.png", "{t} depth/{i}.png {t} rgb/{i}.png"])
+def test_associations_of_tum_name_images_and_depth_maps_in_either_order(line, tmp_path):
+    folder = tum(tmp_path / "scan")
+    (folder / "depth").mkdir()
+    for i in range(4):
+        shutil.copy(folder / "rgb" / f"{i}.png", folder / "depth")
+    (folder / "rgb.txt").unlink()
+    (folder / "depth.txt").unlink()
+    lines = "".join(f"{line.format(t=i + 0.5, i=i)}\n" for i in range(4))
+    (folder / "associations.txt").write_text(lines)
+    capture = Capture.open(folder)
+    np.testing.assert_allclose([frame.E for frame in capture.frames], TRUE, atol=1e-6)
+    assert [frame.image for frame in capture.frames] == [folder / f"rgb/{i}.png" for i in range(4)]
+    assert [frame.depth for frame in capture.frames] == [folder / f"depth/{i}.png" for i in range(4)]
+    (folder / "associations.txt").write_text("0.5 rgb/0.png\n")
+    with pytest.raises(InputError, match="seconds and file names, twice a line"):
+        Capture.open(folder)
 
 
 def test_a_video_takes_its_poses_from_a_trajectory(tmp_path):

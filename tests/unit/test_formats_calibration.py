@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin._checks import InputError
@@ -316,3 +317,91 @@ def test_every_pair_of_a_folder_has_its_own_cameras(tmp_path):
     first = read("right.jpg")
     assert np.abs(read("other.jpg").E - first.E).max() > 0.01
     assert read("right.jpg").E.tolist() == first.E.tolist()
+
+
+RS_VIEW = {"width": 848, "height": 480, "ppx": 424.0, "ppy": 240.0, "fx": 420.0, "fy": 421.0}
+RS_APART = {"rotation": [1, 0, 0, 0, 1, 0, 0, 0, 1], "translation": [-0.05, 0, 0]}
+
+
+@pytest.mark.parametrize(
+    "further",
+    [
+        {"infrared1_to_infrared2": RS_APART, "color": RS_VIEW | {"fx": 900.0}, "depth_to_color": RS_APART},
+        {"infrared1_to_infrared2": RS_APART, "cameras": {"RGB": RS_VIEW}, "rgb": RS_APART},
+        {"baseline": 0.05},
+    ],
+)
+def test_the_infrared_pair_of_a_realsense_is_told_from_its_other_cameras(reading, further):
+    rig = reading(json.dumps({"infrared1": RS_VIEW, "infrared2": RS_VIEW | {"ppx": 426.0}} | further))
+    assert (rig.K_left[0, 0], rig.K_left[0, 2], rig.K_right[0, 2]) == (420, 424, 426)
+    np.testing.assert_allclose(rig.E[:3, 3], (0.05, 0, 0))
+
+
+@pytest.mark.parametrize(
+    "entries", [{}, {"a": RS_VIEW, "b": RS_VIEW, "baseline_mm": 50}, {"a": RS_VIEW, "baseline": 0.05}]
+)
+def test_a_realsense_without_a_pair_is_not_called_cut_off(reading, entries):
+    with pytest.raises(InputError, match="two rs2 intrinsics.*their baseline in metres"):
+        reading(json.dumps(entries or RS_VIEW))
+
+
+def test_a_region_of_interest_of_ros_moves_the_principal_point(reading):
+    """``image_geometry``: K and P are of the whole sensor, images of its region of interest."""
+
+    def info(shift: float, x_offset: int) -> str:
+        roi = {"x_offset": x_offset, "y_offset": 60, "width": 320, "height": 240, "do_rectify": False}
+        P = [480.0, 0, 322.0, shift, 0, 480.0, 241.0, 0, 0, 0, 1.0, 0]
+        entries = {"width": 640, "height": 480, "distortion_model": "plumb_bob", "D": [0.1] * 5, "P": P}
+        return yaml.safe_dump(entries | {"roi": roi})
+
+    rig = reading(info(0.0, 100), info(-48.0, 120))
+    assert rig.size_left == rig.size_right == (320, 240)
+    np.testing.assert_allclose(rig.K_left[:2, 2], (222, 181))
+    np.testing.assert_allclose(rig.K_right[:2, 2], (202, 181))
+    np.testing.assert_allclose(rig.E[:3, 3], (0.1, 0, 0))
+
+
+LINES = {
+    "colons": "fx: {}\nfy: {}\ncx: {}\ncy: {}\nbaseline: {}\n",
+    "equals": "# mine\nfx = {}\nfy={}\ncx = {} # px\ncy = {}\nbaseline_m = {}\n",
+}
+
+
+@pytest.mark.parametrize("form", LINES)
+def test_numbers_by_their_names_are_read(reading, form):
+    rig = reading(LINES[form].format(500.0, 501.0, 320.5, 240.0, 0.12))
+    np.testing.assert_array_equal(rig.K_left, [[500, 0, 320.5], [0, 501, 240], [0, 0, 1]])
+    np.testing.assert_array_equal(rig.K_right, rig.K_left)
+    assert rig.E[0, 3] == 0.12
+    with pytest.raises(InputError, match="no 'cy'"):
+        reading(LINES[form].format(500.0, 501.0, 320.5, "?", 0.12))
+    with pytest.raises(InputError, match="the baseline"):
+        reading(LINES[form].format(500.0, 501.0, 320.5, 240.0, -0.12))
+
+
+@pytest.mark.parametrize("names", [("K1", "K2"), ("K_left", "K_right"), ("cameraMatrixL", "cameraMatrixR")])
+def test_named_matrices_may_be_plain_yaml(reading, names):
+    K = [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]
+    rig = reading(yaml.safe_dump({names[0]: K, names[1]: K, "R": np.eye(3).tolist(), "T": [-0.12, 0, 0]}))
+    np.testing.assert_array_equal(rig.K_left, K)
+    np.testing.assert_allclose(rig.E[:3, 3], (0.12, 0, 0))
+    with pytest.raises(InputError, match="no M2"):
+        reading(yaml.safe_dump({names[0]: K, "R": np.eye(3).tolist(), "T": [-0.12, 0, 0]}))
+
+
+@pytest.mark.parametrize(
+    ("text", "cure"),
+    [
+        ("intrinsics:\n  camRect0:\n    camera_matrix: [1, 2, 3, 4]\n", "DSEC.*camRect"),
+        ("camera.height=960\ncamera.A=[1085 0 640; 0 1085 480; 0 0 1]\nt=0.159\n", "rc_visard.*--baseline"),
+    ],
+)
+def test_calibrations_that_are_not_read_are_named_with_their_cure(reading, text, cure):
+    with pytest.raises(InputError, match=cure):
+        reading(text)
+
+
+def test_a_matrix_of_middlebury_may_have_commas(reading):
+    K = "[700, 0, 300; 0, 700, 200; 0, 0, 1]"
+    rig = reading(f"cam0={K}\ncam1={K}\ndoffs=0\nbaseline=80\n")
+    np.testing.assert_array_equal(rig.K_left, [[700, 0, 300], [0, 700, 200], [0, 0, 1]])

@@ -118,6 +118,18 @@ def test_what_is_no_photograph_of_this_capture_is_not_taken_for_one(place, tmp_p
         Capture.open(folder)
 
 
+def test_names_of_one_file_are_not_sought_elsewhere(tmp_path):
+    """Two could mean what lies in the usual place; another capture's files of that name are not these."""
+    folder = colmap_text(tmp_path / "a/b/scan")
+    shutil.copytree(folder / "images", tmp_path / "a/b/of-another")
+    text = (folder / "sparse/0/images.txt").read_text()
+    for name, twin in (("f00", "f01"), ("f01", "f01"), ("f02", "f03"), ("f03", "f03")):
+        text = text.replace(f" {name}.png", f" {name}/{twin}.png")
+    (folder / "sparse/0/images.txt").write_text(text)
+    with pytest.raises(InputError, match="no image file"):
+        Capture.open(folder)
+
+
 def test_a_few_chance_names_are_not_taken_for_the_images(tmp_path):
     folder = colmap_text(tmp_path / "a/b/scan")
     target = moved(folder, "scan/odd")
