@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._kernels import launch_bound, use_kernel
-from geodiff_plugin._strips import STRIP_PIXELS, row_strips
+from geodiff_plugin._kernels import use_kernel
+from geodiff_plugin._strips import row_strips
 from geodiff_plugin.algorithm.correction import log_depth_at
 from geodiff_plugin.algorithm.terms import match_exposure
 from geodiff_plugin.geometry import as_fine_as, image_size, warp_right_to_left
@@ -149,17 +149,24 @@ def reprojection(
     for image, K_right, T in views:
         image, K_right = as_fine_as(image, K_right, K_left[0])
         warped, seen = _warped(image[None], depth_m, K_left, K_right[None], T[None])
-        error = torch.zeros_like(depth_m)
-        # One by one where a copy of all three counts.
-        at_once = left_01.shape[1] if launch_bound(depth_m) and depth_m.numel() <= STRIP_PIXELS else 1
-        for layer in range(0, left_01.shape[1], at_once):
-            channels = slice(layer, layer + at_once)
-            matched = match_exposure(warped[:, channels], left_01[:, channels], seen)
-            error += matched.sub_(left_01[:, channels]).abs_().sum(1, keepdim=True)
-        error /= left_01.shape[1]
+        error = _photometric_error(warped, left_01, seen)
         best = torch.where(seen, torch.minimum(best, error), best)
         visible |= seen
     return visible, best.where(visible, torch.zeros_like(best))
+
+
+def _photometric_error(warped: Tensor, left_01: Tensor, seen: Tensor) -> Tensor:
+    """Mean absolute difference ``(1, 1, H, W)`` of a warped image, in the left one's exposure."""
+    if use_kernel(seen):
+        from geodiff_plugin.result import exposure_kernels
+
+        return exposure_kernels.photometric_error(warped, left_01, seen)
+    error = torch.zeros_like(warped[:, :1])
+    for layer in range(left_01.shape[1]):  # one by one: a copy of all three counts
+        channel = slice(layer, layer + 1)
+        matched = match_exposure(warped[:, channel], left_01[:, channel], seen)
+        error += matched.sub_(left_01[:, channel]).abs_()
+    return error.div_(left_01.shape[1])
 
 
 def _warped(

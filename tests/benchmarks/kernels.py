@@ -28,6 +28,7 @@ from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.matching import kernels as matching
 from geodiff_plugin.matching.census import MARGIN_PX, SIDE, VOTE_LEVELS
 from geodiff_plugin.matching.consistency import EVERY_ROW
+from geodiff_plugin.result import exposure_kernels as exposure
 from geodiff_plugin.result import kernels as result
 from geodiff_plugin.runtime import kernels as runtime
 from geodiff_plugin.scale import kernels as scale
@@ -109,6 +110,13 @@ def _of_the_result() -> Iterator[Compiled]:
     yield Compiled("sharp edges", edge_kernels.sharpen_kernel, sharpen, sizes, warps)
     sizes = {"CHANNELS": 3, "BLOCK": result.BLOCK, "VOTES": result.VOTES}
     vote = 11 * "*fp32 " + "fp32 fp32 i32 i32"
+    images, sizes = "*fp32 *fp32 *i1 ", {"CHANNELS": 3, "PIXELS": exposure.PIXELS}
+    yield Compiled("exposure, sums", exposure.sums_kernel, images + "*fp32 i32", sizes, 4)
+    yield Compiled("exposure, squares", exposure.squares_kernel, images + "*fp32 *fp32 i32", sizes, 4)
+    cells = images + "*fp32 *fp32 *fp32 i32 i32"
+    yield Compiled("exposure, cells", exposure.cells_kernel, cells, sizes, 4)
+    error = 6 * "*fp32 " + "i32 i32"
+    yield Compiled("photometric error", exposure.error_kernel, error, sizes, 4)
     enlarge, around = (
         4 * "*fp32 " + 4 * "i32 ",
         {"CHANNELS": 3, "BLOCK": result.BLOCK, "AROUND": result.AROUND},

@@ -59,6 +59,7 @@ WITH_KERNELS = (
     "_voted",
     "_enlarged",
     "_warped",
+    "_photometric_error",
     "depth_confidence",
 )
 #: Functions, and methods as ``Class.method``, whose operations are shown apart; each without those below it.

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin.matching.rows import RowMatches
-from geodiff_plugin.result.confidence import Grounds, _warped, depth_confidence
+from geodiff_plugin.result.confidence import Grounds, _photometric_error, _warped, depth_confidence
 from geodiff_plugin.result.voting import WIDE, Voters, _crispness, _enlarged, _step_shares, _voted
 from tests.kernels.drawn import drawn
 
@@ -135,3 +135,24 @@ def test_enlarged_votes(device, seed, size, larger):
     # As of the votes; and a pixel half way between two may be rounded to either.
     off = ((found - expected).abs() > 1e-5 * expected.abs().amax()).float().mean()
     assert off <= 5e-3 and found.isfinite().all()
+
+
+@drawn(3)
+@given(
+    seed=st.integers(0, 999),
+    size=st.tuples(st.integers(1, 50), st.integers(1, 50)),
+    channels=st.sampled_from([1, 3]),
+    hidden=st.floats(0.0, 1.0),
+)
+@example(seed=0, size=(31, 45), channels=3, hidden=0.3)
+@example(seed=1, size=(50, 37), channels=1, hidden=1.0)  # nothing is seen
+def test_the_photometric_error(device, seed, size, channels, hidden):
+    """Under another gain, another bias and a shading from one side."""
+    generator = torch.Generator().manual_seed(seed)
+    left = torch.rand(1, channels, *size, generator=generator)
+    right = 0.7 * left + 0.1 + 0.2 * torch.linspace(0.0, 1.0, size[1]) + 0.05 * torch.rand(left.shape)
+    seen = torch.rand(1, 1, *size, generator=generator) >= hidden
+    given = [part.to(device) for part in (right, left, seen)]
+    found = _photometric_error(*given)
+    with without_kernels():
+        torch.testing.assert_close(found, _photometric_error(*given), rtol=1e-5, atol=1e-5)
