@@ -91,7 +91,7 @@ def _transformed(blocks: Tensor, basis: Tensor) -> Tensor:
 
 
 def _steps_at_edges(levels: Tensor, axis: int) -> Tensor:
-    """Mean step from the pixels of each of the 8 columns of blocks to the next, ``(N, 8)``; 0 for rows."""
+    """Mean step from a pixel to the one below (axis 0) or beside it (1), by place modulo 8, ``(N, 8)``."""
     steps = levels.diff(dim=axis + 1).abs().clamp_max(_MOST_BLOCK_EDGE).mean(2 - axis)
     return steps[:, : steps.shape[1] // _BLOCK * _BLOCK].view(len(levels), -1, _BLOCK).mean(1)
 
@@ -130,7 +130,10 @@ def find_flaws(levels: Tensor) -> list[Flaws]:
 
 
 def _jpeg_scales(levels: Tensor, begins: np.ndarray) -> list[float]:
-    """The largest steps of which the coefficients are multiples; blocks begin at ``begins (N, 2)``."""
+    """``Flaws.jpeg_scale`` of every picture, whose blocks begin at ``begins (N, 2)``, row and column.
+
+    Of each of some coefficients the largest step is sought of which its values are multiples.
+    """
     blocks = _some_blocks(levels, begins)
     value = (blocks @ to_device_of(levels, _coefficients(_KEPT))).abs()[..., None]  # (N, n, kept, 1)
     step = np.arange(2, _MOST_STEP, dtype=np.float32)
@@ -144,7 +147,7 @@ def _jpeg_scales(levels: Tensor, begins: np.ndarray) -> list[float]:
 
 
 def _some_blocks(levels: Tensor, begins: np.ndarray) -> Tensor:
-    """Pixels ``(N, n, 64)`` of at most ``_MOST_BLOCKS`` blocks; 0 where an image has fewer than others."""
+    """Pixels ``(N, n, 64)`` of at most ``_MOST_BLOCKS`` blocks; 0 where a picture has fewer than others."""
     rows, columns = ((np.array(levels.shape[1:]) - begins) // _BLOCK).T[..., None]
     every = np.maximum(1, -(-rows * columns // _MOST_BLOCKS))
     block = np.arange((-(-rows * columns // every)).max()) * every
