@@ -1,4 +1,7 @@
-"""Fixtures, which import what they need when they are asked for: who only hands out tests needs nothing."""
+"""Fixtures, which import what they need when they are asked for.
+
+The process of pytest-xdist that hands out tests loads this file too, and would wait for torch in vain.
+"""
 
 import os
 from pathlib import Path

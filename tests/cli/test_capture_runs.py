@@ -165,15 +165,8 @@ def test_a_failed_frame_before_an_untrusted_one_is_a_sentence(scan, geodiff):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM to be caught")
 def test_asked_to_end_it_clears_away_what_it_began(finished, tmp_path):
-    out, given = tmp_path / "out", ["--prior-map", finished / "maps", "--poses", "given"]
-    words = [
-        "capture",
-        finished / "scan",
-        "--out",
-        out,
-        *given,
-        *"--steps 1 --processes 2 --device cpu -q".split(),
-    ]
+    out, quick = tmp_path / "out", "--poses given --steps 1 --processes 2 --device cpu -q".split()
+    words = ["capture", finished / "scan", "--out", out, "--prior-map", finished / "maps", *quick]
     shell = [sys.executable, "-m", "geodiff_plugin", *map(str, words)]
     with subprocess.Popen(shell, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
         deadline = time.monotonic() + 300
