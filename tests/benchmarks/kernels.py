@@ -64,6 +64,7 @@ def launches() -> Iterator[Compiled]:
     yield from _of_the_networks()
     yield from _of_the_scale()
     yield from _of_the_result()
+    yield from _of_the_photometric_error()
 
 
 def _of_the_matching() -> Iterator[Compiled]:
@@ -110,13 +111,6 @@ def _of_the_result() -> Iterator[Compiled]:
     yield Compiled("sharp edges", edge_kernels.sharpen_kernel, sharpen, sizes, warps)
     sizes = {"CHANNELS": 3, "BLOCK": result.BLOCK, "VOTES": result.VOTES}
     vote = 11 * "*fp32 " + "fp32 fp32 i32 i32"
-    images, sizes = "*fp32 *fp32 *i1 ", {"CHANNELS": 3, "PIXELS": exposure.PIXELS}
-    yield Compiled("exposure, sums", exposure.sums_kernel, images + "*fp32 i32", sizes, 4)
-    yield Compiled("exposure, squares", exposure.squares_kernel, images + "*fp32 *fp32 i32", sizes, 4)
-    cells = images + "*fp32 *fp32 *fp32 i32 i32"
-    yield Compiled("exposure, cells", exposure.cells_kernel, cells, sizes, 4)
-    error = 6 * "*fp32 " + "i32 i32"
-    yield Compiled("photometric error", exposure.error_kernel, error, sizes, 4)
     enlarge, around = (
         4 * "*fp32 " + 4 * "i32 ",
         {"CHANNELS": 3, "BLOCK": result.BLOCK, "AROUND": result.AROUND},
@@ -133,6 +127,16 @@ def _of_the_result() -> Iterator[Compiled]:
     yield Compiled("confidence", result.confidence_kernel, confidence, sizes, 4)
     sizes = {"CHANNELS": 3, "PIXELS": result.PIXELS}
     yield Compiled("warp", result.warp_kernel, "*fp32 *fp32 *fp32 *fp32 *i1 i32 i32 i32 i32", sizes, 4)
+
+
+def _of_the_photometric_error() -> Iterator[Compiled]:
+    images, sizes = "*fp32 *fp32 *i1 ", {"CHANNELS": 3, "PIXELS": exposure.PIXELS}
+    yield Compiled("exposure, sums", exposure.sums_kernel, images + "*fp32 i32", sizes, 4)
+    yield Compiled("exposure, squares", exposure.squares_kernel, images + "*fp32 *fp32 i32", sizes, 4)
+    cells = images + "*fp32 *fp32 *fp32 i32 i32"
+    yield Compiled("exposure, cells", exposure.cells_kernel, cells, sizes, 4)
+    error = 6 * "*fp32 " + "i32 i32"
+    yield Compiled("photometric error", exposure.error_kernel, error, sizes, 4)
 
 
 def _of_the_scale() -> Iterator[Compiled]:

@@ -137,7 +137,7 @@ def test_enlarged_votes(device, seed, size, larger):
     assert off <= 5e-3 and found.isfinite().all()
 
 
-@drawn(3)
+@drawn(1)
 @given(
     seed=st.integers(0, 999),
     size=st.tuples(st.integers(1, 50), st.integers(1, 50)),
