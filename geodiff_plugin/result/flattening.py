@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin.algorithm.correction import edge_links, log_depth_at
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
 from geodiff_plugin.geometry import image_size
@@ -64,15 +65,27 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor) ->
     links = edge_links(guide, log_depth)
     least = LEAST_VALUE_WEIGHT * (WEAK_PRIOR / error).clamp_min(1.0) ** 4
     weight = (known**2 / (1.0 - known).clamp_min(1e-6) + least).clamp_max(MOST_VALUE_WEIGHT)
+    pull = _towards_smoothed(inverse, known, links)
+    change = solve_field(FieldSystem(weight, pull, SLOPES * links[0], SLOPES * links[1]), STEPS)
+    factor = (1.0 + change / inverse).clamp_min(LEAST_SHARE).log()
+    factor = F.interpolate(factor, image_size(depth_m), mode="bilinear", align_corners=False)
+    return (depth_m * torch.exp(-factor)).to(depth_m.dtype)
+
+
+def _towards_smoothed(inverse: Tensor, known: Tensor, links: tuple[Tensor, Tensor]) -> Tensor:
+    """The pull ``(1, 1, h, w)`` of values whose slopes are drawn to the smoothed ones."""
+    if use_kernel(inverse):
+        from geodiff_plugin.result import flattening_kernels as kernels
+
+        weight, pull = kernels.slopes(inverse, known, links)  # of both axes, as a batch
+        system = FieldSystem(weight, pull, SLOPE_SMOOTHNESS * links[0], SLOPE_SMOOTHNESS * links[1])
+        return kernels.forces(inverse, solve_field(system, STEPS), links)
     pull = torch.zeros_like(inverse)
     for axis, link in zip((-1, -2), links, strict=True):
         slope = inverse.diff(dim=axis)
         force = SLOPES * link * (_smoothed(slope, axis, known, links) - slope)
         pull += _after(force, axis, first=True) - _after(force, axis, first=False)
-    change = solve_field(FieldSystem(weight, pull, SLOPES * links[0], SLOPES * links[1]), STEPS)
-    factor = (1.0 + change / inverse).clamp_min(LEAST_SHARE).log()
-    factor = F.interpolate(factor, image_size(depth_m), mode="bilinear", align_corners=False)
-    return (depth_m * torch.exp(-factor)).to(depth_m.dtype)
+    return pull
 
 
 def _after(between: Tensor, axis: int, *, first: bool) -> Tensor:

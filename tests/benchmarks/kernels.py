@@ -29,6 +29,7 @@ from geodiff_plugin.matching import kernels as matching
 from geodiff_plugin.matching.census import MARGIN_PX, SIDE, VOTE_LEVELS
 from geodiff_plugin.matching.consistency import EVERY_ROW
 from geodiff_plugin.result import exposure_kernels as exposure
+from geodiff_plugin.result import flattening_kernels as flattening
 from geodiff_plugin.result import kernels as result
 from geodiff_plugin.runtime import kernels as runtime
 from geodiff_plugin.scale import kernels as scale
@@ -61,6 +62,7 @@ def launches() -> Iterator[Compiled]:
     yield from _of_the_matching()
     yield from _of_the_solver()
     yield from _of_the_fit()
+    yield from _of_the_flattening()
     yield from _of_the_networks()
     yield from _of_the_scale()
     yield from _of_the_result()
@@ -181,6 +183,12 @@ def _of_the_fit() -> Iterator[Compiled]:
     yield Compiled("levels of a fit", correction.levels_kernel, "*fp32 *fp32 *fp32 i32 fp32", block, 4)
     edges = 4 * "*fp32 " + 4 * "i32 "
     yield Compiled("matches off edges", correction.off_edges_kernel, edges, block, 4)
+
+
+def _of_the_flattening() -> Iterator[Compiled]:
+    block = {"BLOCK": flattening.BLOCK}
+    yield Compiled("slopes", flattening.slopes_kernel, 6 * "*fp32 " + "i32 i32", block, 4)
+    yield Compiled("pull of the slopes", flattening.forces_kernel, 5 * "*fp32 " + "i32 i32", block, 4)
 
 
 def resources(launch: Compiled, architecture: int) -> tuple[int, int]:

@@ -51,6 +51,7 @@ WITH_KERNELS = (
     "_spread",
     "_levels",
     "off_edges",
+    "_towards_smoothed",
     "_best_range",
     "fit_to_points",
     "refine_to_matches",
