@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -69,7 +70,7 @@ def remaining_distortion(tracks: Tracks, T: np.ndarray) -> Remaining:
     """The distortion that matches of one right view show under ``T (4, 4)``, ``T_right_from_left``."""
     tracks = tracks.kept(np.abs(epipolar(tracks, T).off_px) < MOST_OFF_PX)
     if len(tracks) < FEWEST:
-        return Remaining(float("nan"), float("nan"))
+        return Remaining(math.nan, math.nan)  # the one NaN, by which equal verdicts are equal
     k1 = _certain_k1(tracks, T, np.zeros((len(tracks), 0)))
     if k1 == 0.0:
         return Remaining(0.0, 0.0)
