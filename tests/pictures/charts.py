@@ -114,7 +114,13 @@ CHARTS = (
         "results-trust", 1, "Shares that were not trusted, and that got a warning or were not trusted", SHARES
     ),
     Chart("results-trust", 2, PROMISED, (Column(3), Column(4)), names=2),
-    Chart("results-trust", 3, PROMISED, PROMISES),
+    Chart(
+        "results-trust",
+        3,
+        "Confidence of plain walls, of pixels that are off and of the others, and how well it tells them apart",
+        (Column(3), Column(4), Column(7)),
+    ),
+    Chart("results-trust", 4, PROMISED, PROMISES),
     Chart("strength", 1, f"Errors by the prior's own error; {LOWER}", names=2, one_scale=False),
     Chart(
         "strength",
