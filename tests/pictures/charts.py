@@ -117,7 +117,7 @@ CHARTS = (
     Chart(
         "results-trust",
         3,
-        "Confidence of plain walls, of pixels that are off and of the others, and how well it tells them apart",
+        "Confidence of plain walls where they are off and where right, and how well it tells these apart",
         (Column(3), Column(4), Column(7)),
     ),
     Chart("results-trust", 4, PROMISED, PROMISES),
