@@ -52,7 +52,7 @@ __all__ = ["PARTS", "Bench", "Scope", "main"]
 BUDGET_S, GRACE_S = 210, 60
 #: A function, or a method as ``Class.method``, and what it is a part of: indented below it.
 STAGES = (
-    "GeometryGuidance.prepare",
+    "GeometryGuidance.evidence_of",
     "  clean",
     "  refine_views",
     "  build_cost_volume",
