@@ -569,31 +569,11 @@ def looked_up(levels: Tensor, rows: np.ndarray, columns: np.ndarray) -> Tensor:
 
 @triton.jit
 def weigh_kernel(
-    position_in,
-    best_in,
-    runner_up_in,
-    contrast_in,
-    sharpness_in,
-    other,
-    warp,
-    valid,
-    made,
-    planes,
-    pixels,
-    width,
-    other_rows,
-    other_row,
-    canvas_height,
-    canvas_width,
-    valid_row,
-    first_inverse_depth,
-    plane_step,
-    sum_unit,
-    FIRST: tl.constexpr,
-    HAS_VALID: tl.constexpr,
-    EVERY_ROW: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    position_in, best_in, runner_up_in, contrast_in, sharpness_in, other, warp, valid, made,
+    planes, pixels, width, other_rows, other_row, canvas_height, canvas_width, valid_row,
+    first_inverse_depth, plane_step, sum_unit,
+    FIRST: tl.constexpr, HAS_VALID: tl.constexpr, EVERY_ROW: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """What a right view says about the winners of BLOCK pixels, and by it and those before their result.
 
     ``made`` are confidence, deviation and inverse depth; ``warp (3, planes)`` is the scale of every plane,
