@@ -333,10 +333,11 @@ class GeometryEvidenceStep(Block):
         guidance = GeometryGuidance(block_state.right, block_state.K, block_state.E, **knobs)
         asked = block_state.num_inference_steps
         steps, rounds = count_guided_steps(host, guidance, asked)
-        evidence = guidance.prepare(left_images(block_state.image).to(host.vae.device))
+        lefts_01 = left_images(block_state.image).to(host.vae.device)
+        evidence = guidance.prepare(lefts_01)
         signature = inspect.signature(host.__call__)
         call = {name: value.default for name, value in signature.parameters.items()}
-        call |= {"image": block_state.image, "num_inference_steps": steps}
+        call |= {"image": lefts_01, "num_inference_steps": steps}
         grid = ProcessingGrid(block_state.content, block_state.padding)
         codec = MapCodec(host, prior_of(host), grid)
         block_state.geometry = GuidedRun(codec, guidance, lambda: evidence, call, rounds)

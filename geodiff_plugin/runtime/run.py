@@ -36,7 +36,7 @@ class GuidedRun:
         codec: the pipeline, its prior and the grid that the stock call denoises on.
         guidance: what the user gave.
         evidence: gives act 1's answer, one per image; it may have to wait for it.
-        call: arguments of the stock call that act 2 runs in.
+        call: arguments of the stock call that act 2 runs in; its image is a tensor on the device.
         rounds: of guidance in each denoising step.
         callback: the user's, which runs while the pipeline has no hooks.
     """

@@ -16,6 +16,14 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no 
 OF_THE_SYSTEM = {"posix", "_io", "fcntl"}
 
 
+@pytest.fixture(autouse=True)
+def heeds_ctrl_c():
+    """What a shell starts in the background ignores SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def send_after(number: int, signum: int):
     """A profile function that sends this process a signal after the system call of that number."""
     count = itertools.count()
