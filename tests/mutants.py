@@ -442,9 +442,13 @@ MUTANTS = [
         tests=(*CAPTURES, f"{UNIT}pose_refine.py"),
     ),
     *of(
+        "_certain.py",
+        ("abs(value) - UNCERTAIN * error", "abs(value) + UNCERTAIN * error"),
+        tests=(f"{UNIT}pose_refine.py",),
+    ),
+    *of(
         "pose/lens.py",
         ("A[:, 0] = (ahead - behind)", "A[:, 0] = (behind - ahead)"),
-        ("abs(k1) - UNCERTAIN * error", "abs(k1) + UNCERTAIN * error"),
         (", _error_by_blocks(inverse, pulls, blocks(tracks)))", ", 0.0)"),
         tests=(f"{UNIT}pose_refine.py",),
     ),

@@ -10,6 +10,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "geodiff_plugin"
 
 LAYER = {
     "_camera_checks": 0,
+    "_certain": 0,
     "_checks": 0,
     "_kernels": 0,
     "_lazy": 0,

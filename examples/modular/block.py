@@ -376,7 +376,6 @@ class MetresStep(Block):
         """As the guided pipeline ends a call."""
         run, processor = block_state.geometry, components.image_processor
         depth_m = _at_image_size(processor, run.metric_prediction(block_state.latents), block_state)
-        run.check_finite()
         stock = MarigoldDepthOutput(depth_m, None, None)
         out = run.output(stock, block_state.guidance.warned)
         block_state.guided_output, block_state.depth_m = out, out.prediction[0, ..., 0]

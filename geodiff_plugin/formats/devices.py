@@ -118,7 +118,8 @@ def _rs_json(text: str) -> tuple[Camera, Camera, np.ndarray]:
     views = _of_pair([(name, values) for name, values in found if "ppx" in values], 2)
     between = _of_pair([(name, values) for name, values in found if "translation" in values], 1)
     baseline = next((data[name] for name in RS_BASELINES if isinstance(data, dict) and name in data), None)
-    if len(views) != 2 or len(between) != 1 and (between or baseline is None):
+    is_posed = len(between) == 1 or (not between and baseline is not None)
+    if len(views) != 2 or not is_posed:
         expected = "two rs2 intrinsics (fx, fy, ppx, ppy), of the infrared pair, and their extrinsics alone"
         cure = "Keep those of the infrared pair; their baseline in metres does for the extrinsics."
         bad_value("the file", expected, f"{len(views)} and {len(between)}", cure)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -93,12 +92,10 @@ def find_moved(
     masks, of other captures, hidden ones and those whose names are in ``other`` are left out.
 
     Raises:
-        InputError: several files fit a name as well.
+        InputError: several files fit a name equally well.
     """
     for top in (folder.absolute(), *folder.absolute().parents)[: levels + 1]:
-        of_stem: dict[str, list[Path]] = {}
-        for path in islice(_images_below(top, other), MOST_LISTED):
-            of_stem.setdefault(_stem(path.name), []).append(path)
+        of_stem = _by_stem(_images_below(top, other))
         files = _claimed_once([_best(name, of_stem) for name in names])
         if sum(file is not None for file in files) >= max(1, LEAST_FOUND * len(names)):
             common = os.path.commonpath([file.parent for file in files if file is not None])
@@ -176,10 +173,7 @@ class _Finder:
 
     def _stems(self, folder: Path) -> dict[str, list[Path]]:
         if folder not in self._by_stem:
-            stems: dict[str, list[Path]] = {}
-            for path in images_in(folder):
-                stems.setdefault(_stem(path.name), []).append(path)
-            self._by_stem[folder] = stems
+            self._by_stem[folder] = _by_stem(images_in(folder))
         return self._by_stem[folder]
 
 
@@ -187,6 +181,14 @@ def _parts(name: str) -> list[str]:
     """The parts of a path, of Windows too, without its beginning."""
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", ".")]
     return parts[1:] if parts and parts[0].endswith(":") else parts
+
+
+def _by_stem(paths: Iterable[Path]) -> dict[str, list[Path]]:
+    """Paths by their names without suffix."""
+    stems: dict[str, list[Path]] = {}
+    for path in paths:
+        stems.setdefault(_stem(path.name), []).append(path)
+    return stems
 
 
 def _stem(name: str) -> str:

@@ -147,6 +147,11 @@ class Candidates(NamedTuple):
     views: Iterator[ViewEvidence]  # of every right view, made as it is asked for
 
 
+def _contrast_and_sharpness(found: Winner) -> Tensor:
+    """Both of ``Candidates``, ``(2, H, W)``."""
+    return window_mean(torch.stack([found.gain, found.sharpness]), CONTRAST_REACH)
+
+
 def candidates(volume: CostVolume, views: Sequence[AlignedView]) -> Candidates:
     """The winners of a volume, with the evidence of these right views.
 
@@ -165,7 +170,7 @@ def candidates(volume: CostVolume, views: Sequence[AlignedView]) -> Candidates:
             features = torch.stack([torch.ones_like(margin), (margin + 0.03).log(), cost, differs])
             yield ViewEvidence(features, difference)
 
-    contrast, sharpness = window_mean(torch.stack([found.gain, found.sharpness]), CONTRAST_REACH)
+    contrast, sharpness = _contrast_and_sharpness(found)
     inverse_depth = volume.inverse_depth[0] + position * volume.plane_step
     return Candidates(inverse_depth, contrast, sharpness, evidence())
 
@@ -199,7 +204,7 @@ def _match_by_kernels(volume: CostVolume) -> Matches:
 
     buffers = Buffers()
     found = _left_winner(volume, buffers)
-    means = window_mean(torch.stack([found.gain, found.sharpness]), CONTRAST_REACH)
+    means = _contrast_and_sharpness(found)
     others = [_right_winners(volume, view, buffers) for view in volume.aligned]
     confidence, deviation, inverse_depth = kernels.weighed(volume, found, means, others)[:, None]
     return Matches(inverse_depth, confidence, to_device_of(confidence, volume.plane_step), deviation)

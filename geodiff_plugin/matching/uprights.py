@@ -14,6 +14,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from geodiff_plugin._certain import certain_part
+
 #: Shortest line, as a share of the picture's height.
 SHORTEST = 0.06
 #: An upright line moves along the rows by this per row at most.
@@ -34,8 +36,6 @@ LEAST_SPREAD = 0.1
 MOST_OFF = 3.0
 #: Slopes of lines are exact to this, in pixels per row.
 EXACT = 0.01
-#: So many standard errors of an estimate are not counted.
-UNCERTAIN = 4.0
 #: Steps of a robust fit.
 STEPS = 8
 #: Middle half of a normal distribution in standard deviations, and what a median's error is to a mean's.
@@ -114,8 +114,8 @@ def certain_shear(grey: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> f
     """Pixels per row by which the right picture of a rectified pair is certainly sheared along its rows.
 
     It is the median of ``dd/dv - k d`` over upright lines, whose common ``k`` the left picture alone gives,
-    moved towards 0 by ``UNCERTAIN`` standard errors. As matchers flatten surfaces, part of ``k d`` may be
-    missing from ``dd/dv``: of the medians with and without it the one nearer to 0 counts.
+    of which the ``certain_part`` counts. As matchers flatten surfaces, part of ``k d`` may be missing from
+    ``dd/dv``: of the medians with and without it the one nearer to 0 counts.
 
     Args:
         grey: ``(H, W)`` uint8, the left picture.
@@ -149,7 +149,7 @@ def certain_shear(grey: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> f
 
 
 def _certain_median(values: np.ndarray) -> float:
-    """The median, moved towards 0 by ``UNCERTAIN`` standard errors."""
+    """The ``certain_part`` of the median."""
     low, middle, high = np.quantile(values, (0.25, 0.5, 0.75))
     error = MEDIAN_OVER_MEAN * (high - low) / MIDDLE_HALF / math.sqrt(len(values))
-    return float(np.sign(middle) * max(abs(middle) - UNCERTAIN * error, 0.0))
+    return certain_part(float(middle), float(error))

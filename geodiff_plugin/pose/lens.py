@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from geodiff_plugin._certain import certain_part
 from geodiff_plugin.pose.tracks import FEWEST, TINY, Tracks, blocks, epipolar
 
 #: Matches further off their epipolar lines than this are wrong, pixels.
@@ -22,8 +23,6 @@ STEP_K1 = 0.01
 STEP_TURN = 1e-4
 #: No lens of a camera with a rectilinear picture has more.
 MOST_K1 = 0.6
-#: So many standard errors of an estimate are not counted.
-UNCERTAIN = 4.0
 
 
 class _Pair(NamedTuple):
@@ -96,9 +95,9 @@ def _certain_k1(tracks: Tracks, T: np.ndarray, explained: np.ndarray) -> float:
 
     It minimises ``sum_i rho(e_i(k1) + c + b . a_i)``, with ``e_i`` the signed distance of match i from its
     epipolar line when ``k1`` is removed from both pictures, ``c`` a shift across the lines, ``a_i`` the
-    match's row of the other explanations, and Cauchy's ``rho``; the estimate is moved towards 0 by
-    ``UNCERTAIN`` standard errors. The standard error is the larger of two: as if matches erred
-    independently, and as the sums over blocks of the left image show, since neighbours err alike.
+    match's row of the other explanations, and Cauchy's ``rho``; the ``certain_part`` of the estimate counts.
+    Its standard error is the larger of two: as if matches erred independently, and as the sums over blocks of
+    the left image show, since neighbours err alike.
     """
     pair, k1, others = _pair(tracks, T), 0.0, np.zeros(explained.shape[1])
     # Derivatives of the residuals by k1, by the shift and by the others.
@@ -116,7 +115,7 @@ def _certain_k1(tracks: Tracks, T: np.ndarray, explained: np.ndarray) -> float:
         k1, others = float(np.clip(k1 - step[0], -MOST_K1, MOST_K1)), step[2:]
     inverse, pulls = np.linalg.inv(H), A * (weight * (off - A @ step))[:, None]
     error = max(scale * float(np.sqrt(inverse[0, 0])), _error_by_blocks(inverse, pulls, blocks(tracks)))
-    return float(np.sign(k1)) * max(abs(k1) - UNCERTAIN * error, 0.0)
+    return certain_part(k1, error)
 
 
 def _error_by_blocks(inverse: np.ndarray, pulls: np.ndarray, block: np.ndarray) -> float:

@@ -69,16 +69,22 @@ def _matched(values, sums, squares, channel, CHANNELS: tl.constexpr):
 
 
 @triton.jit
+def _cell(i, j, height, width):
+    """Upper row, left column, height and width of a cell, as ``adaptive_avg_pool2d`` divides an image."""
+    top, side = i * height // _CELL_ROWS, j * width // _CELL_COLUMNS
+    rows = ((i + 1) * height + (_CELL_ROWS - 1)) // _CELL_ROWS - top
+    columns = ((j + 1) * width + (_CELL_COLUMNS - 1)) // _CELL_COLUMNS - side
+    return top, side, rows, columns
+
+
+@triton.jit
 def cells_kernel(
     left, warped, visible, sums, squares, parts, height, width,
     CHANNELS: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip
     """Sums over the cells: what of them is visible, and the differences that remain. Grid: cells, parts."""
     cell, part = tl.program_id(0), tl.program_id(1)
-    i, j = cell // _CELL_COLUMNS, cell % _CELL_COLUMNS
-    top, side = i * height // _CELL_ROWS, j * width // _CELL_COLUMNS
-    rows = ((i + 1) * height + (_CELL_ROWS - 1)) // _CELL_ROWS - top
-    columns = ((j + 1) * width + (_CELL_COLUMNS - 1)) // _CELL_COLUMNS - side
+    top, side, rows, columns = _cell(cell // _CELL_COLUMNS, cell % _CELL_COLUMNS, height, width)
     parts += (cell * tl.num_programs(1) + part) * (1 + CHANNELS)
     for channel in tl.static_range(CHANNELS):
         seen, differs = tl.zeros([PIXELS], tl.float32), tl.zeros([PIXELS], tl.float32)
@@ -98,9 +104,7 @@ def cells_kernel(
 @triton.jit
 def _shading(cells, i, j, channel, height, width, CHANNELS: tl.constexpr):
     """The mean difference in a cell, less where little of it is visible."""
-    top, side = i * height // _CELL_ROWS, j * width // _CELL_COLUMNS
-    rows = ((i + 1) * height + (_CELL_ROWS - 1)) // _CELL_ROWS - top
-    columns = ((j + 1) * width + (_CELL_COLUMNS - 1)) // _CELL_COLUMNS - side
+    _, _, rows, columns = _cell(i, j, height, width)
     of_cell = cells + (i * _CELL_COLUMNS + j) * (1 + CHANNELS)
     counted = tl.load(of_cell) + (rows * columns).to(tl.float32) * _CELL_PRIOR
     return tl.load(of_cell + 1 + channel) / counted

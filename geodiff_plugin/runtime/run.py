@@ -139,7 +139,7 @@ class GuidedRun:
         try:
             results = [finish(*of_image, options) for of_image in of_images]
         finally:  # also where it fails on what is not finite
-            self.check_finite()
+            self._check_finite()
         return stack_results(
             results,
             guidance,
@@ -149,7 +149,7 @@ class GuidedRun:
             as_numpy=call["output_type"] != "pt",
         )
 
-    def check_finite(self) -> None:
+    def _check_finite(self) -> None:
         """Raise ``InputError`` on the first tensor of the loop that was not finite.
 
         Once, after all has been asked of the device: reading it earlier would wait for the network.

@@ -30,8 +30,12 @@ _FULLEST = tl.constexpr(points.FULLEST)
 _EPS = tl.constexpr(FLOOR_EPS)
 #: Pixels of a program that works on each by itself.
 PIXELS = 1024
-#: What such a program makes of a map.
-FLOORED, METRIC, RELATIVE = 0, 1, 2
+#: What such a program makes of a map: ``smooth_floor``.
+FLOORED = 0
+#: Metres.
+METRIC = 1
+#: The relative map of metres.
+RELATIVE = 2
 _FLOORED, _METRIC = tl.constexpr(FLOORED), tl.constexpr(METRIC)
 #: Matches of a program that are held at once, at least: fewer would compile another kernel for few matches.
 _LEAST_BLOCK = 1024

@@ -178,9 +178,8 @@ def _best_of(groups: Groups, volume: CostVolume, space: str, near_m: Tensor, far
     """The best of candidate ends ``(M,)`` for one map."""
     depth_m = SPACES[space].depth_at(groups.mean[None], near_m[:, None], far_m[:, None])
     mean, share = look_up(groups, volume.inverse_depth, depth_m)
-    mean = (
-        mean + (share < least_in_view(volume)) * 1.0
-    )  # so one of these wins only if no pair keeps enough in view
+    # Of those that keep too few in view one wins only if no pair keeps enough.
+    mean = mean + (share < least_in_view(volume)) * 1.0
     k = mean.argmin(keepdim=True)  # a 0-d index would be read back from the device
     return _Best(near_m[k], far_m[k], mean[k])
 
