@@ -246,6 +246,11 @@ class GuidanceConfig:
             size if self.step_latents is None else self.step_latents,
         )
 
+    def needs_matches(self, points_given: bool) -> bool:
+        """Whether a call uses matches of its views: they have a weight, and something is moved by it."""
+        moved = self.correct or self.crisp or self.plan_updates(points_given).inner_steps > 0
+        return moved and bool(self.weights.get("matches"))
+
     def changed(self, **knobs: Any) -> Self:
         """This configuration with some knobs set otherwise; ``InputError`` for no such knob, or its value."""
         for name in knobs:

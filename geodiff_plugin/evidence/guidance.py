@@ -128,7 +128,7 @@ class GeometryGuidance:
             self.inputs = read_inputs(given, cropped=cropped, unit=unit)
         self.assumed: list[Message] = []
         if not isinstance(K, (tuple, list)):
-            assume_same_centre(self)
+            self.assumed = assumed_centre(self.rigs)
         self.measured_baseline = measured_baseline
         self.evidence_store: EvidenceStore | None = None
         self._cropped, self._left_size = cropped, check_size(left_size, "left_size")
@@ -275,7 +275,7 @@ class GeometryGuidance:
             )
         guidance.warned, guidance.estimated = warned, rig
         if K_right is None:
-            assume_same_centre(guidance)
+            guidance.assumed = assumed_centre(guidance.rigs)
         return guidance
 
     @classmethod
@@ -354,20 +354,19 @@ class GeometryGuidance:
 
     def evidence_of(self, lefts_01: Tensor) -> list[Evidence]:
         """As ``prepare``, of images that ``check_left_images`` has seen already."""
-        used = self.updates.inner_steps > 0 or self.config.correct or self.config.crisp
-        needs_matches = used and bool(self.config.weights.get("matches"))
         make = make_evidence if self.evidence_store is None else self.evidence_store.get
         with WithinCores():  # may be called outside of a guided call
             return [
-                make(left_01, given, self.config, needs_matches, self.measured_baseline)
+                make(left_01, given, self.config, self.measured_baseline)
                 for left_01, given in zip(lefts_01, self.inputs, strict=True)
             ]
 
 
-def assume_same_centre(guidance: GeometryGuidance) -> None:
-    """Note that the right camera's K was not given, where the cameras are parallel: there it matters most."""
-    if any(np.trace(rig.E[:3, :3]) > 1.0 + 2.0 * PARALLEL for rig in guidance.rigs):
-        guidance.assumed = [SAME_CENTRE]
+def assumed_centre(rigs: Sequence[Rig]) -> list[Message]:
+    """What is assumed without a K of the right camera; said of parallel cameras, where it matters most."""
+    # The trace of a rotation is 1 + 2 cos(angle).
+    parallel = any(np.trace(rig.E[:3, :3]) > 1.0 + 2.0 * PARALLEL for rig in rigs)
+    return [SAME_CENTRE] if parallel else []
 
 
 def _check_sufficient(config: GuidanceConfig, updates: UpdatePlan, *, views: bool, points: bool) -> None:

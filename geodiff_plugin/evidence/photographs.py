@@ -22,7 +22,7 @@ from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.estimate import Scale, estimate_poses, find_scale, polished
 from geodiff_plugin.pose.solve import depth_spread, undetermined_pose
 from geodiff_plugin.pose.tracks import coarse_depth, grey_views
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PosedViews
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,17 +107,18 @@ def estimate_rig(
     cloud = None if known.points is None else _as_cloud(as_points(known.points, "points"), K_left, size)
     images = list(cleaned(images, DEFAULT))
 
-    def posed(Ts: Iterable[np.ndarray]) -> list[CameraView]:
-        return [
+    def posed(Ts: Iterable[np.ndarray]) -> PosedViews:
+        rights = (
             CameraView(image, *(torch.as_tensor(m, dtype=torch.float32, device="cpu") for m in matrices))
             for image, *matrices in zip(images[1:], Ks[1:], Ts, strict=True)
-        ]
+        )
+        return PosedViews(images[0], tuple(rights), K_left)
 
-    views = grey_views(images[0], posed([np.eye(4)] * (len(images) - 1)), K_left)
+    views = grey_views(posed([np.eye(4)] * (len(images) - 1)))
     tracks, poses = estimate_poses(views)
     Ts, spread = np.stack([pose.T for pose in poses]), None
     if not all(pose.rectified for pose in poses):
-        depth_m = coarse_depth(images[0], posed(Ts), K_left, views[0][0].shape)
+        depth_m = coarse_depth(posed(Ts), views[0][0].shape)
         Ts, tracks = polished(views, Ts, depth_m, tracks.seen_anywhere())
         spread = depth_spread(tracks, Ts)
     factor = tracks.K_left[0, 0] / Ks[0][0, 0]

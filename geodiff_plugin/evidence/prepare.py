@@ -23,9 +23,9 @@ from geodiff_plugin.matching.matches import read_above
 from geodiff_plugin.matching.rows import RowMatches, match_rectified
 from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.pose.refine import refine_views, untouched
+from geodiff_plugin.pose.refine import refine_views, unchecked
 from geodiff_plugin.scale.points import RELIABLE, reliable_matches
-from geodiff_plugin.types import CameraView, PosedViews, PoseReport
+from geodiff_plugin.types import PosedViews, PoseReport
 
 
 def cleaned(images: Sequence[Tensor], config: GuidanceConfig) -> Sequence[Tensor]:
@@ -33,59 +33,56 @@ def cleaned(images: Sequence[Tensor], config: GuidanceConfig) -> Sequence[Tensor
     return clean(images, config.sweep_pixels) if config.clean_photographs else images
 
 
+def _with_clean_images(posed: PosedViews, config: GuidanceConfig) -> PosedViews:
+    left_01, *images = cleaned([posed.left_01, *(view.image_01 for view in posed.views)], config)
+    views = (view._replace(image_01=image) for view, image in zip(posed.views, images, strict=True))
+    return posed._replace(left_01=left_01, views=tuple(views))
+
+
 def make_evidence(
-    left_01: Tensor, given: Inputs, config: GuidanceConfig, needs_matches: bool, measured: bool = False
+    left_01: Tensor, given: Inputs, config: GuidanceConfig, measured_baseline: bool = False
 ) -> Evidence:
     """Clean the photographs, refine the poses, and prepare the ``Evidence`` of one native left image.
 
-    ``needs_matches``: the volume is aggregated and checked against each view. ``measured``: baseline lengths
-    are measured.
+    ``measured_baseline``: a refined pose keeps the distance between the cameras.
     """
-    native, points = given.beside(left_01), given.points_on(left_01.device)
-    if not native.views:
-        return prepare_evidence(native, points, config, needs_matches)
-    left_01, *images = cleaned([native.left_01, *(view.image_01 for view in native.views)], config)
-    views = [view._replace(image_01=image) for view, image in zip(native.views, images, strict=True)]
-    posed = PosedViews(left_01, tuple(views), native.K_left)
+    posed, points = given.beside(left_01), given.points_on(left_01.device)
+    if not posed.views:
+        return prepare_evidence(posed, points, config)
+    posed = _with_clean_images(posed, config)
     if config.pose == "given":
-        return prepare_evidence(posed, points, config, needs_matches, untouched(views)[1])
-
-    def checked() -> tuple[tuple[CameraView, ...], PoseReport]:
-        return refine_views(left_01, views, native.K_left, measured)
-
-    check, as_given = Beside(checked, left_01.device), None
+        return prepare_evidence(posed, points, config, unchecked(posed.views))
+    check = Beside(lambda: refine_views(posed, measured_baseline), left_01.device)
+    as_given = None
     try:
-        if leaves_cpu_free(left_01.device):  # for the check; meanwhile, as most poses fit:
-            with suppress(InputError):  # said below, if it is not mended by a better pose
-                as_given = prepare_evidence(posed, points, config, needs_matches)
+        if leaves_cpu_free(left_01.device):
+            # The check keeps the CPU busy; meanwhile the device matches under the given poses, as most fit.
+            with suppress(InputError):  # raised again below, unless a refined pose mends it
+                as_given = prepare_evidence(posed, points, config)
         used, report = check.result()
     finally:
         check.close()
-    if as_given is not None and all(one is other for one, other in zip(used, views, strict=True)):
+    if as_given is not None and all(one is other for one, other in zip(used, posed.views, strict=True)):
         return replace(as_given, pose=report, warnings=distinct(report.warnings, as_given.warnings))
-    return prepare_evidence(posed._replace(views=tuple(used)), points, config, needs_matches, report)
+    return prepare_evidence(posed._replace(views=used), points, config, report)
 
 
 def prepare_evidence(
-    native: PosedViews,
-    points: Tensor | None,
-    config: GuidanceConfig,
-    needs_matches: bool,
-    pose: PoseReport | None = None,
+    native: PosedViews, points: Tensor | None, config: GuidanceConfig, pose: PoseReport | None = None
 ) -> Evidence:
     """Cost volume, matches and points of one image and its right views, each of native size.
 
-    ``needs_matches``: the volume is aggregated and checked against each view. ``pose`` reports how the poses
-    fit and whether they were refined.
+    ``pose`` reports how the poses fit and whether they were refined.
     """
-    grid = PosedViews(*matching.to_grid(*native, config.sweep_pixels))
+    needs_matches = config.needs_matches(points is not None)
+    grid = matching.to_grid(native, config.sweep_pixels)
     volume, matches, known_points = None, None, None
     warnings: list[Message] = [] if pose is None else list(pose.warnings)
     if native.views and (config.search == "volume" or needs_matches):
-        volume = matching.build_cost_volume(*native, depth_range=config.depth_range, config=config)
+        volume = matching.build_cost_volume(native, depth_range=config.depth_range, config=config)
         if needs_matches:
             matches = matching.match_volume(volume)
-        if matching.inverse_pose_preferred(*native, matches):
+        if matching.inverse_pose_preferred(native, matches):
             warnings.append(INVERSE)
     if points is not None:
         known_points, left_out = matching.points_to_matches(points, native.K_left, native.size, grid.size)

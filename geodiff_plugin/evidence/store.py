@@ -28,21 +28,21 @@ class EvidenceStore:
         left_01: Tensor,
         given: Inputs,
         config: GuidanceConfig,
-        needs_matches: bool,
-        measured: bool = False,
+        measured_baseline: bool = False,
     ) -> Evidence:
         """What ``make_evidence`` gives for these arguments; the caller must not change it."""
         views = [value for view in given.views for value in view]
         tensors = [left_01, torch.from_numpy(given.K_left), given.points, *views]
         knobs = ("pose", "crisp", "clean_photographs", "depth_range", "planes", "sweep_pixels")
+        needs_matches = config.needs_matches(given.points is not None)
         settings = (*(getattr(config, name) for name in knobs), config.search == "volume")
-        settings = (*settings, needs_matches, measured, given.unit)
+        settings = (*settings, needs_matches, measured_baseline, given.unit)
         for held, made_with, evidence, seconds in self._entries:
             if made_with == settings and len(held) == len(tensors) and all(map(_equal, held, tensors)):
                 self._spared += seconds
                 return evidence
         start = time.perf_counter()
-        evidence = make_evidence(left_01, given, config, needs_matches, measured)
+        evidence = make_evidence(left_01, given, config, measured_baseline)
         # Copies, so that an image that was changed in place since is not taken for the same.
         held = [value.clone() if self._copies and value is not None else value for value in tensors]
         self._entries.insert(0, (held, settings, evidence, time.perf_counter() - start))

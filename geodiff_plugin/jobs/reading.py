@@ -18,7 +18,7 @@ from geodiff_plugin._camera_checks import (
 )
 from geodiff_plugin._checks import bad_value, refuse, warn
 from geodiff_plugin.config import GuidanceConfig
-from geodiff_plugin.evidence.guidance import GeometryGuidance, assume_same_centre
+from geodiff_plugin.evidence.guidance import GeometryGuidance, assumed_centre
 from geodiff_plugin.evidence.prepare import cleaned
 from geodiff_plugin.formats import read_calibration, read_image, read_matrix, read_points, rig_from_parameters
 from geodiff_plugin.formats.colmap import check_colmap_names
@@ -154,7 +154,7 @@ def _posed_guidance(
         guidance = GeometryGuidance.from_views(posed, **known, config=config)
     right_given = options.k_right is not None or options.cx_right is not None
     if options.cameras_way() in ("parameters", "matrices") and not right_given:
-        assume_same_centre(guidance)
+        guidance.assumed = assumed_centre(guidance.rigs)
     guidance.assumed = [*guidance.assumed, *_filled_in(options)]
     return guidance
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from geodiff_plugin.geometry import EDGE_PX, constant_like, image_size, sample_at, to_device_of
 from geodiff_plugin.matching.census import MARGIN_PX, census, census_cost, grey_levels
+from geodiff_plugin.types import CameraView
 
 # A view that turning would move by less than this stays as it is.
 _AS_IT_IS_PX = 0.02
@@ -73,15 +74,15 @@ class AlignedView:
 
 
 def align_view(
-    right: tuple[Tensor, Tensor, Tensor], K_left: Tensor, size: tuple[int, int], inverse_depth: Tensor
+    right: CameraView, K_left: Tensor, size: tuple[int, int], inverse_depth: Tensor
 ) -> AlignedView:
-    """Turn a right view parallel to the left one; a rectified right image is its own canvas.
+    """Turn a right view, whose image is grey, parallel to the left one; a rectified one is its own canvas.
 
-    ``right`` is ``(grey (1, Hr, Wr), K, T)``, ``size (H, W)`` the left grid, ``inverse_depth (D,)`` 1/m its
-    planes. The canvas covers the part of the right image on them, at most three left grids wide and high.
+    ``size (H, W)`` is the left grid, ``inverse_depth (D,)`` 1/m are its planes. The canvas covers the part of
+    the right image on them, at most three left grids wide and high.
     """
-    image, *matrices = right
-    K_r, T, K = (each.numpy(force=True).astype(np.float64) for each in (*matrices, K_left))
+    image, matrices = right.image_01, (right.K, right.T_right_from_left, K_left)
+    K_r, T, K = (each.numpy(force=True).astype(np.float64) for each in matrices)
     R, w = T[:3, :3], inverse_depth.cpu().numpy().astype(np.float64)
     centre = R.T @ T[:3, 3]
     ratio = 1.0 + w * centre[2]  # depth in the turned view over depth in the left view

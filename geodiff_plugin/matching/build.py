@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from kornia.geometry.linalg import inverse_transformation
@@ -11,13 +9,13 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.geometry import as_fine_as, image_size, resize_image
+from geodiff_plugin.geometry import as_fine_as, resize_image
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.planes import even_planes, parallax_of
 from geodiff_plugin.matching.sweep import CostVolume, sweep_planes
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PosedViews
 
 # With fewer planes, a parabola through three neighbouring costs fits nothing.
 _FEWEST_PLANES = 24
@@ -52,16 +50,14 @@ _INVERSE_PIXELS = 15_000
 _ENOUGH_MATCHED = 0.4
 
 
-def to_grid(
-    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, pixels: int
-) -> tuple[Tensor, tuple[CameraView, ...], Tensor]:
-    """The left view ``(C, H, W)`` with at most ``pixels``, right views as fine, and K of the left one."""
-    height, width = image_size(left_01)
+def to_grid(posed: PosedViews, pixels: int) -> PosedViews:
+    """The views with a left image of at most ``pixels``, and right ones as fine as that."""
+    height, width = posed.size
     factor = min(1.0, (pixels / (height * width)) ** 0.5)
     size = max(1, round(height * factor)), max(1, round(width * factor))
-    left, K = resize_image(left_01, K_left, size)
-    small = tuple(CameraView(*as_fine_as(image, K_r, K), T) for image, K_r, T in rights)
-    return left, small, K
+    left, K = resize_image(posed.left_01, posed.K_left, size)
+    rights = tuple(CameraView(*as_fine_as(image, K_r, K), T) for image, K_r, T in posed.views)
+    return PosedViews(left, rights, K)
 
 
 def _on_cpu(matrix: Tensor) -> Tensor:
@@ -69,24 +65,24 @@ def _on_cpu(matrix: Tensor) -> Tensor:
     return matrix.detach().to("cpu", torch.float32)
 
 
-def _grey_views(views: Sequence[CameraView]) -> tuple[CameraView, ...]:
-    return tuple(CameraView(grey(image), _on_cpu(K), _on_cpu(T)) for image, K, T in views)
+def _in_grey(posed: PosedViews) -> PosedViews:
+    """The views with grey images and cameras in float32."""
+    rights = tuple(CameraView(grey(image), _on_cpu(K), _on_cpu(T)) for image, K, T in posed.views)
+    return PosedViews(grey(posed.left_01), rights, _on_cpu(posed.K_left))
 
 
 @torch.no_grad()
-def pilot_volume(
-    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, pixels: int = PILOT_PIXELS
-) -> CostVolume:
+def pilot_volume(posed: PosedViews, pixels: int = PILOT_PIXELS) -> CostVolume:
     """A coarse sweep of all depths from infinity to a shift of 40 % of the width.
 
     Its grid has at most ``pixels`` pixels. Other arguments and errors as for ``build_cost_volume``.
     """
-    left, small, K = to_grid(grey(left_01), _grey_views(rights), _on_cpu(K_left), pixels)
-    views = parallax_of(small, K, image_size(left))
-    nearest = [view.inverse_depth_at(PILOT_SHIFT * left.shape[-1]) for view in views]
+    grid = to_grid(_in_grey(posed), pixels)
+    parallax = parallax_of(grid)
+    nearest = [of_view.inverse_depth_at(PILOT_SHIFT * grid.size[1]) for of_view in parallax]
     limit = min(max(nearest), MOST_NEARER * min(nearest))
-    planes = even_planes(views, (0.0, limit), PILOT_STEP_PX, _FEWEST_PLANES, PILOT_PLANES)
-    return sweep_planes(left, small, K, planes, views)
+    planes = even_planes(parallax, (0.0, limit), PILOT_STEP_PX, _FEWEST_PLANES, PILOT_PLANES)
+    return sweep_planes(grid, planes, parallax)
 
 
 def _nearest_inverse_depth(pilot: CostVolume) -> float:
@@ -106,14 +102,9 @@ def _nearest_inverse_depth(pilot: CostVolume) -> float:
 
 @torch.no_grad()
 def build_cost_volume(
-    left_01: Tensor,
-    rights: Sequence[CameraView],
-    K_left: Tensor,
-    *,
-    depth_range: tuple[float, float] | None = None,
-    config: GuidanceConfig = DEFAULT,
+    posed: PosedViews, *, depth_range: tuple[float, float] | None = None, config: GuidanceConfig = DEFAULT
 ) -> CostVolume:
-    """Sweep planes through the left view ``(3, H, W)``, or grey, and compare it with right views of any size.
+    """Sweep planes through the left view, in colour or grey, and compare it with right views of any size.
 
     The planes span ``depth_range``, metres; by default they reach from infinity to somewhat nearer than
     anything that a coarse sweep is certain of. ``config`` bounds their number and the pixels of the grid.
@@ -121,36 +112,33 @@ def build_cost_volume(
     """
     if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
         bad_value("depth_range", "(near, far) in metres with 0 < near < far", depth_range)
-    left, small, K = to_grid(grey(left_01), _grey_views(rights), _on_cpu(K_left), config.sweep_pixels)
+    grid = to_grid(_in_grey(posed), config.sweep_pixels)
     if depth_range is None:
-        span = 0.0, _nearest_inverse_depth(pilot_volume(left, small, K))
+        span = 0.0, _nearest_inverse_depth(pilot_volume(grid))
     else:
         span = 1.0 / depth_range[1], 1.0 / depth_range[0]
-    views = parallax_of(small, K, image_size(left))
-    planes = even_planes(views, span, PLANE_STEP_PX, _FEWEST_PLANES, config.planes)
-    return sweep_planes(left, small, K, planes, views)
+    parallax = parallax_of(grid)
+    planes = even_planes(parallax, span, PLANE_STEP_PX, _FEWEST_PLANES, config.planes)
+    return sweep_planes(grid, planes, parallax)
 
 
 @torch.no_grad()
-def inverse_pose_preferred(
-    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, matches: Matches | None = None
-) -> bool:
+def inverse_pose_preferred(posed: PosedViews, matches: Matches | None = None) -> bool:
     """Whether the inverse pose matches clearly more of the image than the given one.
 
     It does if the images were swapped, or if E is world-to-camera. Two coarse sweeps decide, or none if the
-    ``matches`` under the given pose leave no doubt. Other arguments as for ``build_cost_volume``.
+    ``matches`` under the given pose leave no doubt. Errors as for ``build_cost_volume``.
     """
     if matches is not None and float(matches.confidence.mean()) > _ENOUGH_MATCHED:
         return False
 
-    def confidence(views: Sequence[CameraView]) -> float:
-        return float(match_volume(pilot_volume(left_01, views, K_left, _INVERSE_PIXELS)).confidence.mean())
+    def confidence(of_pose: PosedViews) -> float:
+        return float(match_volume(pilot_volume(of_pose, _INVERSE_PIXELS)).confidence.mean())
 
-    given = confidence(rights)
+    given = confidence(posed)
+    turned_back = (CameraView(image, K, inverse_transformation(T)) for image, K, T in posed.views)
     try:
-        turned = confidence(
-            [CameraView(image, K_right, inverse_transformation(T)) for image, K_right, T in rights]
-        )
+        turned = confidence(posed._replace(views=tuple(turned_back)))
     except ValueError:  # under the inverse pose the views do not overlap, so it is not the true one
         turned = 0.0
     return turned > _CLEARLY * given

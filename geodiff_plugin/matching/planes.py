@@ -14,7 +14,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.geometry import NEAREST_M
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import PosedViews
 
 #: Pixels of the grid that stand for all of it, at least: enough for medians.
 SAMPLES = 1024
@@ -90,10 +90,14 @@ class Parallax:
         return 10.0 ** (NEVER_SHIFTED + span * step / STEPS)
 
 
-def parallax_of(rights: Sequence[CameraView], K_left: Tensor, size: tuple[int, int]) -> tuple[Parallax, ...]:
-    """The ``Parallax`` of every right view on the left grid ``(H, W)``."""
-    names = ["E"] if len(rights) == 1 else [f"E of right view {v}" for v in range(1, len(rights) + 1)]
-    return tuple(Parallax(K_left, K, T, size, name) for (_, K, T), name in zip(rights, names, strict=True))
+def parallax_of(posed: PosedViews) -> tuple[Parallax, ...]:
+    """The ``Parallax`` of every right view on the left image's grid."""
+    count = len(posed.views)
+    names = ["E"] if count == 1 else [f"E of right view {v}" for v in range(1, count + 1)]
+    return tuple(
+        Parallax(posed.K_left, K, T, posed.size, name)
+        for (_, K, T), name in zip(posed.views, names, strict=True)
+    )
 
 
 def even_planes(

@@ -17,7 +17,7 @@ from geodiff_plugin.matching.alignment import AlignedView, ComparedView, align_v
 from geodiff_plugin.matching.census import COST_LEVELS, MARGIN_PX, census, grey_levels
 from geodiff_plugin.matching.planes import LEAST_SHIFT_PX, Parallax, parallax_of
 from geodiff_plugin.matching.winner import UNSEEN_LEVEL
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import PosedViews
 
 
 @dataclass(frozen=True)
@@ -60,27 +60,23 @@ class CostVolume:
 
 @torch.no_grad()
 def sweep_planes(
-    left_01: Tensor,
-    rights: Sequence[CameraView],
-    K_left: Tensor,
-    inverse_depth: Tensor,
-    parallax: tuple[Parallax, ...] | None = None,
+    posed: PosedViews, inverse_depth: Tensor, parallax: tuple[Parallax, ...] | None = None
 ) -> CostVolume:
-    """Compare the left view ``(1, H, W)``, grey in [0, 1], with the right views on every plane.
+    """Compare the left view with the right views, all grey in [0, 1], on every plane.
 
     Images keep their resolution; the right ones should have about as many pixels per radian. A cost is the
     mean over the views that see the pixel. ``inverse_depth (D,)`` 1/m is ascending and even, D >= 2. The
     reference computes planes one by one, so that memory is that of the result, two bytes per pixel and plane.
     ``parallax`` is ``parallax_of`` these views, where it is known already.
     """
-    size, planes, K = image_size(left_01), inverse_depth.cpu(), K_left.cpu()
-    aligned = tuple(align_view(right, K_left, size, planes) for right in rights)
-    left = grey_levels(F.pad(left_01[None], (MARGIN_PX,) * 4, mode="replicate")[0, 0])
+    planes, K = inverse_depth.cpu(), posed.K_left.cpu()
+    aligned = tuple(align_view(view, K, posed.size, planes) for view in posed.views)
+    left = grey_levels(F.pad(posed.left_01[None], (MARGIN_PX,) * 4, mode="replicate")[0, 0])
     compare = _all_planes if use_kernel(left) else _plane_by_plane
     levels, in_view = compare(left, aligned)
-    rectified = all(bool(is_rectified(K, K_right, T)) for _, K_right, T in rights)
-    parallax = parallax or parallax_of(rights, K, size)
-    return CostVolume(levels, in_view, planes, left_01, aligned, parallax, rectified)
+    rectified = all(bool(is_rectified(K, view.K, view.T_right_from_left)) for view in posed.views)
+    parallax = parallax or parallax_of(posed)
+    return CostVolume(levels, in_view, planes, posed.left_01, aligned, parallax, rectified)
 
 
 def _plane_by_plane(left: Tensor, views: Sequence[AlignedView]) -> tuple[Tensor, Tensor]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -33,7 +34,7 @@ from geodiff_plugin.pose.tracks import (
     solve_inverse_depth,
     sparse_tracks,
 )
-from geodiff_plugin.types import CameraView, PoseReport
+from geodiff_plugin.types import CameraView, PosedViews, PoseReport
 
 #: Largest median distance of matches from their epipolar lines at which the pose of a rectified rig fits: its
 #: lenses alone err this much.
@@ -78,21 +79,25 @@ _DRIFT = (
     "calibration (pose='given', --knob pose=given)."
 )
 
-_Refined = tuple[tuple[CameraView, ...], PoseReport]
-"""The right views that everything downstream works with, and the report."""
+
+class CheckedViews(NamedTuple):
+    """The right views with the poses and images that everything after the check uses, and its report."""
+
+    views: tuple[CameraView, ...]
+    report: PoseReport
 
 
-def untouched(rights: Sequence[CameraView], status: str = "given") -> _Refined:
-    """The views as given, and a report with that status."""
+def unchecked(rights: Sequence[CameraView], status: str = "given") -> PoseReport:
+    """The report of poses that are used as they were given, without a check."""
     poses = _as_E(_poses(rights))
-    return tuple(rights), PoseReport(status, poses, poses)
+    return PoseReport(status, poses, poses)
 
 
 @dataclass(frozen=True, eq=False)
 class _Misfit:
     """Right views whose poses do not fit, and what is known of them."""
 
-    rights: Sequence[CameraView]
+    rights: tuple[CameraView, ...]
     sizes: Sequence[tuple[int, int]]  # (H, W) of the right images that the tracks are of
     tracks: Tracks
     given: np.ndarray  # (V, 4, 4) T_right_from_left
@@ -102,24 +107,20 @@ class _Misfit:
     measured: bool  # whether the lengths of the baselines are
 
 
-def refine_views(
-    left_01: Tensor,
-    rights: Sequence[CameraView],
-    K_left: Tensor,
-    measured: bool = False,
-) -> _Refined:
-    """Check the poses against the images ``(3, H, W)`` in [0, 1], and refine them where they do not fit.
+def refine_views(posed: PosedViews, measured: bool = False) -> CheckedViews:
+    """Check the poses against the images, and refine them where they do not fit.
 
     ``measured`` baselines keep their lengths, as those of a rectified rig do; others are weighed against the
     depth of the scene. The given views are returned if they fit, if there are too few matches, if a mistake
     explains the misfit, or if no better pose is near. A rectified rig is refined only if the dense matches
     miss it as well.
     """
-    views, given = grey_views(left_01, rights, K_left), _poses(rights)
+    rights = posed.views
+    views, given = grey_views(posed), _poses(rights)
     sparse = sparse_tracks(views)
     counts = sparse.seen.sum(1)
     if counts.max(initial=0) < FEWEST:
-        return untouched(rights, "not checked")
+        return CheckedViews(rights, unchecked(rights, "not checked"))
     before, poses = median_residuals(sparse, given), _as_E(given)
     residual_px = tuple(before.tolist())
     report = PoseReport("fits", poses, poses, residual_px, residual_px, tuple(map(float, counts)))
@@ -127,20 +128,20 @@ def refine_views(
     fits_px = FITS_PX if rig else POSED_FITS_PX
     fits = not (before > fits_px).any()
     near = given if fits else nearby_poses(sparse, given, before)
-    heights = [image.shape[-2] for image in (left_01, *(right.image_01 for right in rights))]
+    heights = [image.shape[-2] for image in (posed.left_01, *(right.image_01 for right in rights))]
     tear = find_tear([grey for grey, _ in views], heights)
     report = _with_contradictions(replace(report, tear=tear), sparse, given)
     if mistakes := _messages(sparse, find_mistake, given, near):
-        return tuple(rights), replace(report, status="mistaken", warnings=mistakes)
+        return CheckedViews(rights, replace(report, status="mistaken", warnings=mistakes))
     if fits:
-        return tuple(rights), report
-    depth_m = coarse_depth(left_01, _applied(rights, near), K_left, views[0][0].shape)
+        return CheckedViews(rights, report)
+    depth_m = coarse_depth(posed._replace(views=_applied(rights, near)), views[0][0].shape)
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
     if rig and not ((all_px := median_residuals(tracks, given)) > fits_px).any():
         # The few sparse matches missed by chance: a calibration is not changed for what all do not show.
         residual_px, matches = tuple(all_px.tolist()), tuple(map(float, tracks.seen.sum(1)))
         report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
-        return tuple(rights), report
+        return CheckedViews(rights, report)
     sizes = [(image.shape[0], image.shape[1]) for image, _ in views[1:]]
     return _refined(_Misfit(rights, sizes, tracks, given, near, fits_px, rig, measured), report)
 
@@ -157,7 +158,7 @@ def _with_contradictions(report: PoseReport, tracks: Tracks, given: np.ndarray) 
     )
 
 
-def _refined(misfit: _Misfit, report: PoseReport) -> _Refined:
+def _refined(misfit: _Misfit, report: PoseReport) -> CheckedViews:
     """The views with poses that fit better, and images without the residuals that no pose explains.
 
     The given views where no pose near them is better, or the better one is too far away.
@@ -172,13 +173,13 @@ def _refined(misfit: _Misfit, report: PoseReport) -> _Refined:
     report, doubts = replace(report, depth_spread=apart), _undetermined(apart)
     if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
         warnings = _kept_misfit(before, worst) + doubts
-        return tuple(rights), replace(report, status="kept", warnings=warnings)
+        return CheckedViews(rights, replace(report, status="kept", warnings=warnings))
     turned_deg, shifts = pose_change(given, Ts)
     far = ~((turned_deg < _MOST_TURN_DEG) & (shifts < _MOST_SHIFT))
     if far.any():
         v = int(np.lexsort((np.nan_to_num(before), far & ~np.isnan(before)))[-1])  # the worst of the far ones
         warnings = _too_far(before, after, v, turned_deg[v], shifts[v])
-        return tuple(rights), replace(report, status="kept", warnings=warnings)
+        return CheckedViews(rights, replace(report, status="kept", warnings=warnings))
     keeps_length = misfit.rig or misfit.measured
     Ts, spread = (Ts, None) if keeps_length else _rescaled(tracks, given, Ts, before)
     bends = [
@@ -199,7 +200,7 @@ def _refined(misfit: _Misfit, report: PoseReport) -> _Refined:
         residual_px=tuple(median_residuals(replace(tracks, right_px=straight), Ts).tolist()),
         straightened_px=tuple(0.0 if bend is None else bend.rms_px for bend in bends),
     )
-    return _applied(rights, Ts, bends), report
+    return CheckedViews(_applied(rights, Ts, bends), report)
 
 
 def refined_scale(refined: np.ndarray, given: np.ndarray, misfit: float) -> tuple[float, float]:

@@ -21,7 +21,7 @@ from torch import Tensor
 from geodiff_plugin.geometry import plane_rays, project_rays
 from geodiff_plugin.matching.build import pilot_volume
 from geodiff_plugin.matching.consistency import match_volume
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import PosedViews
 
 #: Longer side of the left image that matches are sought on, pixels; residuals are in pixels of this grid.
 LONG_SIDE = 832
@@ -298,13 +298,10 @@ def grey_image(image_01: Tensor, K_image: Tensor, factor: float) -> GreyImage:
     return np.rint(grey * 255.0).clip(0, 255).astype(np.uint8), K
 
 
-def grey_views(left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor) -> list[GreyImage]:
-    """The images, left one first, at about as many pixels per radian: on the grid of the matches.
-
-    ``left_01 (3, H, W)`` in [0, 1] has ``K_left (3, 3)``.
-    """
-    views = [grey_image(left_01, K_left, min(1.0, LONG_SIDE / max(left_01.shape[-2:])))]
-    for image, K_right, _ in rights:
+def grey_views(posed: PosedViews) -> list[GreyImage]:
+    """The images, left one first, at about as many pixels per radian: on the grid of the matches."""
+    views = [grey_image(posed.left_01, posed.K_left, min(1.0, LONG_SIDE / max(posed.size)))]
+    for image, K_right, _ in posed.views:
         as_fine = float(np.float32(views[0][1][0, 0]) / K_right.numpy(force=True)[0, 0])
         views.append(grey_image(image, K_right, min(1.0, as_fine, 2 * LONG_SIDE / max(image.shape[-2:]))))
     return views
@@ -387,11 +384,9 @@ def _dense_matches(
     return _read(uv, landed).astype(np.float64), holds
 
 
-def coarse_depth(
-    left_01: Tensor, rights: Sequence[CameraView], K_left: Tensor, size: tuple[int, int]
-) -> Tensor:
+def coarse_depth(posed: PosedViews, size: tuple[int, int]) -> Tensor:
     """A rough, smooth depth without holes, ``(1, 1, H, W)`` metres: the matches of a coarse sweep, spread."""
-    matches = match_volume(pilot_volume(left_01, rights, K_left))
+    matches = match_volume(pilot_volume(posed))
     weight = matches.confidence[None] ** 2 + 1e-9
     values = matches.inverse_depth[None] * weight
     above, below = values.clone(), weight.clone()

@@ -325,5 +325,5 @@ def _matched(evidence: Evidence, config: GuidanceConfig) -> Matches:
     """Matches of an image whose configuration asks for none."""
     volume = evidence.volume
     if volume is None:
-        volume = build_cost_volume(*evidence.native, depth_range=config.depth_range, config=config)
+        volume = build_cost_volume(evidence.native, depth_range=config.depth_range, config=config)
     return match_volume(volume)

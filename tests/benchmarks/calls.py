@@ -18,6 +18,7 @@ from geodiff_plugin.config import DEFAULT, config_from_text
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.matching.build import build_cost_volume
 from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
+from geodiff_plugin.types import PosedViews
 from tests.benchmarks.matching import (
     Pair,
     data_pairs,
@@ -47,7 +48,7 @@ def calls_of(pair: Pair, pipe: Any, knobs: str = "") -> dict[str, Callable[[], o
         return pipe(left[None], guidance=guidance, **arguments)
 
     calls = {"plain": lambda: pipe(left[None], **arguments), "guided": guided}
-    sgbm = sgbm_call(pair, disparities_of(build_cost_volume(left, [pair[1]], K), left.shape[-1]))
+    sgbm = sgbm_call(pair, disparities_of(build_cost_volume(PosedViews(left, (pair[1],), K)), left.shape[-1]))
     return calls | {"SGBM": sgbm}
 
 

@@ -26,7 +26,7 @@ from geodiff_plugin.matching.build import build_cost_volume, inverse_pose_prefer
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.sweep import CostVolume, sweep_planes
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PosedViews
 
 __all__ = [
     "Pair",
@@ -124,21 +124,23 @@ def measure(pair: Pair, device: str = "cpu", repeats: int = 3) -> tuple[dict[str
         views as it is made after them, and ``"evidence"``, all of it once; and the volume.
     """
     left, right, K = pair
-    volume = build_cost_volume(left, [right], K)
+    posed = PosedViews(left, (right,), K)
+    volume = build_cost_volume(posed)
     matches, (image, *cameras) = match_volume(volume), right
-    swept = to_grid(grey(left), [CameraView(grey(image), *cameras)], K, DEFAULT.sweep_pixels)
+    in_grey = PosedViews(grey(left), (CameraView(grey(image), *cameras),), K)
+    swept = to_grid(in_grey, DEFAULT.sweep_pixels)
 
     def evidence() -> None:
-        found = match_volume(build_cost_volume(left, [right], K))
-        inverse_pose_preferred(left, [right], K, found)
+        found = match_volume(build_cost_volume(posed))
+        inverse_pose_preferred(posed, found)
 
     stages: dict[str, Callable[[], object]] = {
-        "coarse sweep": lambda: pilot_volume(left, [right], K),
-        "volume": lambda: build_cost_volume(left, [right], K),
-        "sweep": lambda: sweep_planes(*swept, volume.inverse_depth),
+        "coarse sweep": lambda: pilot_volume(posed),
+        "volume": lambda: build_cost_volume(posed),
+        "sweep": lambda: sweep_planes(swept, volume.inverse_depth),
         "one aggregation": lambda: aggregate(volume.levels, volume.left_01[0]),
         "matches": lambda: match_volume(volume),
-        "swapped?": lambda: inverse_pose_preferred(left, [right], K, matches),
+        "swapped?": lambda: inverse_pose_preferred(posed, matches),
         "evidence": evidence,
     }
     kind = 1 if device.startswith("cuda") else 0  # a GPU's work takes no CPU seconds

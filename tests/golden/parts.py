@@ -107,7 +107,7 @@ def scene() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, tuple[CameraView,
 @cache
 def volume(count: int = 2):
     left, _, K, views = scene()
-    return build_cost_volume(left, views[:count], K)
+    return build_cost_volume(PosedViews(left, views[:count], K))
 
 
 @cache
@@ -173,7 +173,7 @@ def rectified() -> dict[str, object]:
 @part
 def cost_volume() -> dict[str, object]:
     both, one = volume(), volume(1)
-    near = build_cost_volume(scene()[0], scene()[3], scene()[2], depth_range=(0.6, 20.0))
+    near = build_cost_volume(PosedViews(scene()[0], scene()[3], scene()[2]), depth_range=(0.6, 20.0))
     result: dict[str, object] = {}
     for name, made in (("both", both), ("one", one), ("given", near)):
         result |= {f"{name}_planes": made.inverse_depth, f"{name}_in_view": made.in_view}
@@ -204,10 +204,10 @@ def matched() -> dict[str, object]:
         }
     left, _, K, views = scene()
     blank = [_fading(image) for image in (left, *(v.image_01 for v in views))]
-    rights = [v._replace(image_01=image) for v, image in zip(views, blank[1:], strict=True)]
-    result["blank_wall"] = match_volume(build_cost_volume(blank[0], rights, K)).confidence
-    turned = [CameraView(v.image_01, v.K, torch.linalg.inv(v.T_right_from_left)) for v in views]
-    asked = [inverse_pose_preferred(left, given, K) for given in (views, turned)]
+    rights = tuple(v._replace(image_01=image) for v, image in zip(views, blank[1:], strict=True))
+    result["blank_wall"] = match_volume(build_cost_volume(PosedViews(blank[0], rights, K))).confidence
+    turned = tuple(CameraView(v.image_01, v.K, torch.linalg.inv(v.T_right_from_left)) for v in views)
+    asked = [inverse_pose_preferred(PosedViews(left, given, K)) for given in (views, turned)]
     return result | {"mirrored": str(asked)}
 
 
@@ -327,7 +327,7 @@ def reflections() -> dict[str, object]:
 def losses() -> dict[str, object]:
     left, _, K, views = scene()
     depth_m, metric = prior()[0], MetricMap("disparity")
-    evidence = prepare_evidence(PosedViews(left, tuple(views), K), _points(), DEFAULT, needs_matches=True)
+    evidence = prepare_evidence(PosedViews(left, tuple(views), K), _points(), DEFAULT)
     x = _nearness(depth_m)
     affine, start = (
         metric.from_range(*(torch.tensor([end]) for end in ends)) for ends in ((3.0, 11.0), (2.8, 13.0))
@@ -521,7 +521,7 @@ def intermediate_images() -> dict[str, object]:
     """Evidence of a call whose grid is smaller than its images."""
     left, _, K, views = scene()
     config = replace(DEFAULT, sweep_pixels=64 * 48)
-    evidence = prepare_evidence(PosedViews(left, tuple(views), K), _points(), config, needs_matches=True)
+    evidence = prepare_evidence(PosedViews(left, tuple(views), K), _points(), config)
     assert evidence.matches is not None and evidence.points is not None
     return {
         "left": evidence.grid.left_01,

@@ -11,7 +11,7 @@ from geodiff_plugin.matching import aggregate, match_volume, sweep_planes
 from geodiff_plugin.matching.aggregation import jump_penalties
 from geodiff_plugin.matching.census import COST_LEVELS, grey
 from geodiff_plugin.matching.winner import NEVER, winner, winner_positions
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PosedViews
 from tests.kernels.drawn import drawn
 from tests.tiny import render_plane
 
@@ -142,9 +142,9 @@ VIEWS = [(name,) for name in POSES] + [("rectified", "turned"), ("turned", "a li
 def test_a_sweep_equals_its_reference(device, names, size, count):
     left, views, K = views_of(names, size, device)
     planes = torch.linspace(0.0, 1.1, count)
-    found = sweep_planes(left, views, K, planes)
+    found = sweep_planes(PosedViews(left, views, K), planes)
     with without_kernels():
-        expected = sweep_planes(left, views, K, planes)
+        expected = sweep_planes(PosedViews(left, views, K), planes)
     assert torch.equal(found.in_view, expected.in_view)
     assert torch.equal(found.levels, expected.levels)
     assert 0 < found.in_view.float().mean() < 1
@@ -154,9 +154,9 @@ def test_a_large_canvas_is_interpolated_in_parts(device, monkeypatch):
     from geodiff_plugin.matching import kernels
 
     left, views, K = views_of(("turned",), (9, 14), device)
-    whole = sweep_planes(left, views, K, torch.linspace(0.0, 1.1, 40))
+    whole = sweep_planes(PosedViews(left, views, K), torch.linspace(0.0, 1.1, 40))
     monkeypatch.setattr(kernels, "_SAMPLES_AT_ONCE", 3 * 15 * whole.aligned[0].size[1])
-    parts = sweep_planes(left, views, K, torch.linspace(0.0, 1.1, 40))
+    parts = sweep_planes(PosedViews(left, views, K), torch.linspace(0.0, 1.1, 40))
     assert torch.equal(parts.levels, whole.levels)
 
 
@@ -164,9 +164,9 @@ def test_a_large_canvas_is_interpolated_in_parts(device, monkeypatch):
 def test_matches_equal_their_reference(device, names):
     left, views, K = views_of(names, (11, 16), device)
     planes = torch.linspace(0.0, 1.1, 7)
-    found = match_volume(sweep_planes(left, views, K, planes))
+    found = match_volume(sweep_planes(PosedViews(left, views, K), planes))
     with without_kernels():
-        expected = match_volume(sweep_planes(left, views, K, planes))
+        expected = match_volume(sweep_planes(PosedViews(left, views, K), planes))
     torch.testing.assert_close(found.inverse_depth, expected.inverse_depth, rtol=1e-5, atol=1e-7)
     torch.testing.assert_close(found.confidence, expected.confidence, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(found.deviation, expected.deviation, rtol=1e-5, atol=1e-5)

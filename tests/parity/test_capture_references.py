@@ -101,7 +101,7 @@ def test_a_shrunk_picture_keeps_every_ray_and_right_views_are_as_fine_as_the_lef
     finer = K.copy()
     finer[:2] *= 2.0
     right = CameraView(torch.rand(3, 480, 640), torch.from_numpy(finer), torch.eye(4))
-    views = grey_views(image, [right], torch.from_numpy(K))
+    views = grey_views(PosedViews(image, (right,), torch.from_numpy(K)))
     assert [grey.shape for grey, _ in views] == [(240, 320), (240, 320)]
     assert views[1][1][0, 0] == pytest.approx(views[0][1][0, 0])
 

@@ -16,7 +16,7 @@ from geodiff_plugin.matching.census import census, census_cost, grey_levels
 from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.sweep import sweep_planes
 from geodiff_plugin.scale.volume_search import group_pixels, look_up
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PosedViews
 from tests.golden.parts import scene, volume
 
 
@@ -67,7 +67,8 @@ def test_a_plane_costs_what_the_views_that_see_the_pixel_say():
         CameraView(view.image_01.mean(0, keepdim=True), view.K, view.T_right_from_left) for view in views
     ]
     planes = torch.linspace(0.01, 0.4, 20)
-    one, other, both = (sweep_planes(grey, given, K, planes) for given in (rights[:1], rights[1:], rights))
+    given = (PosedViews(grey, views, K) for views in (rights[:1], rights[1:], rights))
+    one, other, both = (sweep_planes(posed, planes) for posed in given)
     seen = np.stack([one.in_view, other.in_view])
     assert all(seen[k][~seen[1 - k]].any() for k in (0, 1)) and (~seen).all(0).any()
     costs = np.stack([one.levels, other.levels]).astype(float)

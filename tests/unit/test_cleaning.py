@@ -15,7 +15,7 @@ from geodiff_plugin.jobs.reading import pinhole
 from geodiff_plugin.matching import build_cost_volume, clean, match_volume
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.cleaning import find_flaws
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PosedViews
 from tests.scenes import SyntheticPair, render_pair
 
 GRID = 210_000
@@ -57,7 +57,7 @@ def test_fewer_matches_are_wrong(pair: SyntheticPair, flawed) -> None:
 
     def wrong(images: tuple[torch.Tensor, torch.Tensor]) -> float:
         view = CameraView(images[1], pair.K_right.float(), T)
-        matches = match_volume(build_cost_volume(images[0], [view], pair.K_left.float()))
+        matches = match_volume(build_cost_volume(PosedViews(images[0], (view,), pair.K_left.float())))
         truth, seen = 1.0 / pair.left.depth_m, torch.isfinite(pair.left.depth_m) & ~pair.occluded
         off = ((matches.inverse_depth - truth).abs() / matches.plane_step > 1.5) * matches.confidence
         return float(off[seen].sum() / matches.confidence[seen].sum())
@@ -66,7 +66,7 @@ def test_fewer_matches_are_wrong(pair: SyntheticPair, flawed) -> None:
     assert wrong(cleaned) < 0.9 * wrong((left, right))
     view = CameraView(right, pair.K_right.float(), T)
     config = GuidanceConfig(pose="given")
-    made = make_evidence(left, Inputs(pair.K_left.numpy(), (view,), (), None), config, False)
+    made = make_evidence(left, Inputs(pair.K_left.numpy(), (view,), (), None), config)
     assert torch.equal(made.native.left_01, cleaned[0])
     assert torch.equal(made.native.views[0].image_01, cleaned[1])
 

@@ -38,9 +38,11 @@ def wide_pair(size_right, focal_right, at_m=0.1):
     images = [torch.from_numpy(image).permute(2, 0, 1).float() / 255 for image in (left, right)]
     T = torch.from_numpy(np.linalg.inv(E)).float()
     views = (CameraView(images[1], torch.from_numpy(K_right).float(), T),)
-    config = GuidanceConfig().changed(sweep_pixels=96 * 640, search="one-number")
+    config = GuidanceConfig().changed(
+        sweep_pixels=96 * 640, search="one-number", weights={"photometric": 1.0}
+    )
     native = PosedViews(images[0], views, torch.from_numpy(K).float())
-    return prepare_evidence(native, None, config, needs_matches=False)
+    return prepare_evidence(native, None, config)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +80,7 @@ def test_below_min_visible_the_photographs_have_no_say(min_visible):
     assert (float(loss.total.detach()) > 0.01) == heard and (float(gradient.abs().sum()) > 0) == heard
 
 
-SETTINGS = (GuidanceConfig(), True)
+SETTINGS = (GuidanceConfig(),)
 
 
 @pytest.fixture
@@ -112,10 +114,11 @@ def test_equal_values_are_made_once_and_any_other_anew(made):
     ]
     for image, changes in [(left + 0.1, {}), (left[:, :, :6], {}), *((left, c) for c in others)]:
         store.get(image, replace(given, **changes), *SETTINGS)
-    store.get(left, given, GuidanceConfig(planes=80), True)
+    store.get(left, given, GuidanceConfig(planes=80))
     store.get(left, given, *SETTINGS, True)  # a measured baseline
-    store.get(left, given, GuidanceConfig(inner_steps=0), True)  # nothing that evidence depends on
-    assert len(made) == 5 + len(others)
+    store.get(left, given, GuidanceConfig(weights={"photometric": 1.0}))  # which has no matches
+    store.get(left, given, GuidanceConfig(inner_steps=0))  # nothing that evidence depends on
+    assert len(made) == 6 + len(others)
 
 
 @pytest.mark.parametrize("copies", [True, False])

@@ -7,7 +7,7 @@ from geodiff_plugin.matching import Matches, known_shape, known_share, match_vol
 from geodiff_plugin.matching.consistency import DOUBT_OF_A_PLANE, ENOUGH_KNOWN, FAR_PLANES, LEAST_DEVIATION
 from geodiff_plugin.result.confidence import DETERMINED_FROM, determined
 from geodiff_plugin.result.flattening import flatten
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PosedViews
 
 SIZE = (48, 64)
 WEAK = torch.full((1, 1, 1, 1), 0.2)
@@ -118,7 +118,7 @@ def test_a_blank_wall_has_wide_matches_and_a_textured_one_narrow_ones() -> None:
     T = torch.eye(4)
     T[0, 3] = -0.1
     planes = torch.linspace(0.0, 2.0, 32)  # inverse depths: the wall's is .8
-    matches = match_volume(sweep_planes(left, [CameraView(right, K, T)], K, planes))
+    matches = match_volume(sweep_planes(PosedViews(left, (CameraView(right, K, T),), K), planes))
     assert matches.deviation is not None
     narrow, wide = matches.deviation[0, 20:-20, 30:60], matches.deviation[0, 20:-20, 100:140]
     assert narrow.median() < 2.0 < wide.median() / 2.0

@@ -15,6 +15,7 @@ from geodiff_plugin.matching.aggregation import NEVER, Buffers
 from geodiff_plugin.matching.build import pilot_volume
 from geodiff_plugin.matching.census import COST_LEVELS
 from geodiff_plugin.matching.planes import parallax_of
+from geodiff_plugin.types import CameraView, PosedViews
 from tests.benchmarks.matching import textured_pair
 
 SIZE = (96, 144)
@@ -31,11 +32,11 @@ def scene(turn=0.0, at=SIDEWAYS, size=SIZE):
     E[:3, 3] = torch.tensor(at)
     T = relative_transformation(E[None], torch.eye(4)[None])[0]
     warped = g.warp_right_to_left(texture[None], depth[None], K[None], K[None], T[None])
-    return warped.image[0], (texture, K, T), K, depth, warped.visible[0]
+    return warped.image[0], CameraView(texture, K, T), K, depth, warped.visible[0]
 
 
 def find_matches(left, rights, K):
-    return m.match_volume(m.build_cost_volume(left, rights, K))
+    return m.match_volume(m.build_cost_volume(PosedViews(left, tuple(rights), K)))
 
 
 @pytest.mark.parametrize(
@@ -50,7 +51,7 @@ def test_motion_along_the_view_gives_matches(size, ahead, sideways):
     reliable = matches.confidence > 0.5
     assert reliable.float().mean() > 0.3
     assert ((matches.inverse_depth * truth)[reliable] - 1.0).abs().median() < 0.1
-    assert not m.inverse_pose_preferred(left, [right], K)
+    assert not m.inverse_pose_preferred(PosedViews(left, (right,), K))
 
 
 @pytest.mark.parametrize("size", [(500, 741), (1988, 2964), (375, 1242)])
@@ -59,7 +60,8 @@ def test_a_rectified_pair_stays_one_on_the_grid(size):
     K, T = torch.tensor([[700.0, 0, 300], [0, 700, 200], [0, 0, 1]]), torch.eye(4)
     T[0, 3] = -0.2
     few = DEFAULT.changed(planes=24)
-    assert m.build_cost_volume(image, [(image, K, T)], K, depth_range=(2.0, 50.0), config=few).rectified
+    same = PosedViews(image, (CameraView(image, K, T),), K)
+    assert m.build_cost_volume(same, depth_range=(2.0, 50.0), config=few).rectified
 
 
 def plain_costs(left, right, K, inverse_depth):
@@ -80,8 +82,8 @@ def plain_costs(left, right, K, inverse_depth):
 def test_costs_against_the_definition(turn, at, count):
     """``count``: few planes are warped one by one, many are shifted where the pair is rectified."""
     left, (image, K_right, T), K, _, _ = scene(turn, at)
-    left, right = left.mean(0, keepdim=True), (image.mean(0, keepdim=True), K_right, T)
-    volume = m.sweep_planes(left, [right], K, torch.linspace(0.0, 0.4, count))
+    left, right = left.mean(0, keepdim=True), CameraView(image.mean(0, keepdim=True), K_right, T)
+    volume = m.sweep_planes(PosedViews(left, (right,), K), torch.linspace(0.0, 0.4, count))
     for k in (1, count // 2, count - 1):
         expected, visible = plain_costs(left, right, K, float(volume.inverse_depth[k]))
         assert (volume.in_view[k] != visible).float().mean() < 0.03
@@ -123,23 +125,26 @@ def test_the_memory_of_an_aggregation_serves_the_next_and_the_worst_costs_do_not
 @pytest.mark.parametrize(("turn", "at"), [(0.0, SIDEWAYS), (0.06, (0.25, 0.1, 0.1))])
 def test_swapped_views_and_inverted_poses_are_told(monkeypatch, turn, at):
     left, right, K, _, _ = scene(turn, at)
-    assert not m.inverse_pose_preferred(left, [right], K)
-    assert m.inverse_pose_preferred(left, [(right[0], K, inverse_transformation(right[2]))], K)
-    assert m.inverse_pose_preferred(right[0], [(left, *right[1:])], K)
+    posed, inverse = PosedViews(left, (right,), K), inverse_transformation(right.T_right_from_left)
+    assert not m.inverse_pose_preferred(posed)
+    inverted = right._replace(T_right_from_left=inverse)
+    swapped = right._replace(image_01=left)
+    assert m.inverse_pose_preferred(posed._replace(views=(inverted,)))
+    assert m.inverse_pose_preferred(PosedViews(right.image_01, (swapped,), K))
     asked = []
     monkeypatch.setattr(build, "pilot_volume", lambda *given: asked.append(given) or pilot_volume(*given))
     matches = find_matches(left, [right], K)
     before = len(asked)
-    assert not m.inverse_pose_preferred(left, [right], K, matches) and len(asked) == before
+    assert not m.inverse_pose_preferred(posed, matches) and len(asked) == before
     unsure = replace(matches, confidence=0.1 * matches.confidence)
-    assert not m.inverse_pose_preferred(left, [right], K, unsure) and len(asked) == before + 2
+    assert not m.inverse_pose_preferred(posed, unsure) and len(asked) == before + 2
 
 
 @pytest.mark.parametrize(("turn", "at"), POSES)
 def test_a_plane_is_found_by_the_shift_of_the_median_pixel(turn, at):
     """Its inverse depth is rounded up to steps of .05 %, and the shift is that of a projection."""
-    _, right, K, _, _ = scene(turn, at)
-    (view,) = parallax_of([right], K, SIZE)
+    left, right, K, _, _ = scene(turn, at)
+    (view,) = parallax_of(PosedViews(left, (right,), K))
     for wanted_px in (0.4, 3.0, 10.0):
         inverse_depth = view.inverse_depth_at(wanted_px)
         rows, columns = torch.meshgrid(*(torch.arange(n) for n in SIZE), indexing="ij")
@@ -166,6 +171,8 @@ def test_errors_name_the_argument():
         ([T, away], "E of right view 2 must be a pose under which the views overlap"),
     ):
         with pytest.raises(ValueError, match=message):
-            m.build_cost_volume(left, [(texture, K, pose) for pose in poses], K)
+            views = tuple(CameraView(texture, K, pose) for pose in poses)
+            m.build_cost_volume(PosedViews(left, views, K))
     with pytest.raises(ValueError, match="depth_range"):
-        m.build_cost_volume(left, [(texture, K, T)], K, depth_range=(3.0, 1.0))
+        views = (CameraView(texture, K, T),)
+        m.build_cost_volume(PosedViews(left, views, K), depth_range=(3.0, 1.0))

@@ -261,8 +261,8 @@ def test_a_principal_point_that_is_off_is_seen_in_pictures_of_far_things() -> No
         K_right = rig.K_right.float().clone()
         K_right[0, 2] -= off_px
         T = torch.from_numpy(np.linalg.inv(E)).float()
-        rights = [CameraView(rig.right.image_01.float(), K_right, T)]
-        shares.append(refine_views(left, rights, K_left)[1].behind_infinity)
+        rights = (CameraView(rig.right.image_01.float(), K_right, T),)
+        shares.append(refine_views(PosedViews(left, rights, K_left)).report.behind_infinity)
     assert shares[0] < 0.02 and shares[1] > 0.2
 
 
@@ -335,8 +335,8 @@ def pair():
 
 def posed(pair, E):
     T = torch.from_numpy(np.linalg.inv(E)).float()
-    rights = [CameraView(pair.right.image_01.float(), pair.K_right.float(), T)]
-    return pair.left.image_01.float(), rights, pair.K_left.float()
+    rights = (CameraView(pair.right.image_01.float(), pair.K_right.float(), T),)
+    return PosedViews(pair.left.image_01.float(), rights, pair.K_left.float())
 
 
 def test_a_tracker_keeps_the_scene_and_a_measured_baseline_its_length(pair) -> None:
@@ -347,14 +347,14 @@ def test_a_tracker_keeps_the_scene_and_a_measured_baseline_its_length(pair) -> N
     wrong = about @ pose((1.0, -1.2, 0.4), (0, 0, 0)) @ np.linalg.inv(about) @ E
     length, given_length = (np.linalg.norm(P[:3, 3]) for P in (E, wrong))
     assert abs(np.log(given_length / length)) > 0.1, "else nothing is tested"
-    _, kept = refine_views(*posed(pair, wrong), measured=True)
+    _, kept = refine_views(posed(pair, wrong), measured=True)
     assert kept.status == "refined" and kept.scale_spread is None
     assert np.linalg.norm(kept.E[0][:3, 3]) == pytest.approx(given_length, rel=0.02)
-    _, report = refine_views(*posed(pair, wrong))
+    _, report = refine_views(posed(pair, wrong))
     moved = np.log(np.linalg.norm(report.E[0][:3, 3]) / given_length)
     assert 0.2 < moved / np.log(length / given_length) < 1.2
     assert report.scale_spread > 0.05  # even where both lengths agree
-    native = PosedViews(*posed(pair, wrong))
+    native = posed(pair, wrong)
     seen = Evidence(native, grid=native, volume=None, matches=None, pose=report)
     assert indicators_of(seen, {}).scale_spread == report.scale_spread
     assert np.isnan(indicators_of(seen, {}, has_unit=False).scale_spread)
@@ -362,24 +362,26 @@ def test_a_tracker_keeps_the_scene_and_a_measured_baseline_its_length(pair) -> N
 
 def test_views_are_used_as_given_where_no_better_pose_is_near(pair) -> None:
     E = pair.E.numpy()
-    left, rights, K_left = posed(pair, E)
+    given = posed(pair, E)
+    left, rights, _ = given
     image = rights[0].image_01.permute(1, 2, 0).numpy()
     x, y = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in image.shape[1::-1]))
     waves = cv2.remap(image, x, y + 4 * np.sin(x * np.float32(2 * np.pi / 40)), cv2.INTER_LINEAR)
-    waved = [rights[0]._replace(image_01=torch.from_numpy(waves.transpose(2, 0, 1).copy()))]
-    blank = [rights[0]._replace(image_01=torch.full_like(left, 0.5))]
+    waved = rights[0]._replace(image_01=torch.from_numpy(waves.transpose(2, 0, 1).copy()))
+    blank = torch.full_like(left, 0.5)
+    nothing = given._replace(left_01=blank, views=(rights[0]._replace(image_01=blank),))
     inverse = np.linalg.inv(E)
     for inputs, status, said in (
-        ((left, rights, K_left), "fits", None),
+        (given, "fits", None),
         (posed(pair, E @ pose((0, 0, 10), (0, 0, 0))), "kept", "A pose 10 degrees and .* was not used"),
-        ((left, waved, K_left), "kept", "no pose near it leaves clearly less"),
+        (given._replace(views=(waved,)), "kept", "no pose near it leaves clearly less"),
         (posed(pair, inverse), "mistaken", "world-to-camera"),
-        ((torch.full_like(left, 0.5), blank, K_left), "not checked", None),
+        (nothing, "not checked", None),
     ):
-        used, report = refine_views(*inputs)
+        used, report = refine_views(inputs)
         assert report.status == status and bool(report.warnings) == (said is not None)
         assert said is None or re.search(said, report.warnings[0])
-        assert used[0].image_01 is inputs[1][0].image_01 and used[0][2] is inputs[1][0][2]
+        assert used == inputs.views
 
 
 def test_everything_downstream_sees_the_refined_pose(pair) -> None:
@@ -428,8 +430,9 @@ def test_the_rows_of_a_rig_that_has_drifted_agree_again(seed: int) -> None:
     K_right[1, 2] += 1.5
     drifted = render_pair(seed, size=(240, 320), E=E, K_right=K_right)
     T = torch.from_numpy(np.linalg.inv(rig.E.numpy())).float()
-    rights = [CameraView(drifted.right.image_01.float(), rig.K_right.float(), T)]
-    _, report = refine_views(drifted.left.image_01.float(), rights, rig.K_left.float(), measured=True)
+    rights = (CameraView(drifted.right.image_01.float(), rig.K_right.float(), T),)
+    views = PosedViews(drifted.left.image_01.float(), rights, rig.K_left.float())
+    _, report = refine_views(views, measured=True)
     assert report.status == "refined"
     assert report.residual_px[0] < 0.3 < 0.45 < report.residual_px_given[0]
     assert np.linalg.norm(report.E[0][:3, 3]) == pytest.approx(float(rig.E[0, 3]), rel=0.03)
@@ -439,8 +442,8 @@ def test_a_calibrated_rig_keeps_its_calibration_where_all_matches_fit_it(monkeyp
     """The sparse matches alone miss it by chance; no millimetre of vertical baseline is made of that."""
     rig = render_pair(3, size=(240, 320))
     T = torch.from_numpy(np.linalg.inv(rig.E.numpy())).float()
-    views = [CameraView(rig.right.image_01.float(), rig.K_right.float(), T)]
-    given = rig.left.image_01.float(), views, rig.K_left.float()
+    views = (CameraView(rig.right.image_01.float(), rig.K_right.float(), T),)
+    given = PosedViews(rig.left.image_01.float(), views, rig.K_left.float())
     sparse_tracks = refine.sparse_tracks
 
     def missing(images):
@@ -448,7 +451,7 @@ def test_a_calibrated_rig_keeps_its_calibration_where_all_matches_fit_it(monkeyp
         return replace(sparse, right_px=sparse.right_px + np.array([0.0, 0.6]))
 
     monkeypatch.setattr(refine, "sparse_tracks", missing)
-    used, report = refine_views(*given)
+    used, report = refine_views(given)
     assert report.status == "fits" and used[0] is views[0]
     assert report.residual_px_given[0] < refine.FITS_PX and not report.warnings
 
@@ -460,8 +463,9 @@ def test_a_rig_is_not_told_that_another_pose_fits_as_well(monkeypatch) -> None:
     for turn_deg, told in ((0.0, False), (0.7, True)):
         E = rig.E.numpy() @ pose((turn_deg, 0.0, 0.0), (0, 0, 0))
         right = torch.roll(rig.right.image_01.float(), 2, 1)  # two pixels down, so that neither pose fits
-        views = [CameraView(right, rig.K_right.float(), torch.from_numpy(np.linalg.inv(E)).float())]
-        _, report = refine_views(rig.left.image_01.float(), views, rig.K_left.float())
+        T = torch.from_numpy(np.linalg.inv(E)).float()
+        views = (CameraView(right, rig.K_right.float(), T),)
+        _, report = refine_views(PosedViews(rig.left.image_01.float(), views, rig.K_left.float()))
         messages = [m for m in report.warnings if m.code == "pose.undetermined"]
         assert bool(messages) == told and all(m.forbids_trust for m in messages), report
         assert (report.depth_spread > 0.0) is told

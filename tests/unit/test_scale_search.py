@@ -6,6 +6,7 @@ import torch
 from geodiff_plugin import matching as m
 from geodiff_plugin.scale.points import refine_to_matches
 from geodiff_plugin.scale.volume_search import search_scale
+from geodiff_plugin.types import PosedViews
 from tests.benchmarks.matching import textured_pair
 
 #: Of every space: from depth, and back.
@@ -39,7 +40,7 @@ def error_of(
 @pytest.fixture(scope="module")
 def scene():
     left, right, K, depth = textured_pair(SIZE)
-    return m.build_cost_volume(left, [right], K), depth
+    return m.build_cost_volume(PosedViews(left, (right,), K)), depth
 
 
 @pytest.mark.parametrize("space", SPACES)

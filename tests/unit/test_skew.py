@@ -26,7 +26,7 @@ DEPTH = 1.5 + np.random.default_rng(0).uniform(size=SIZE)
 
 def test_shrinking_keeps_the_skew_of_the_image():
     image = torch.rand(3, *SIZE)
-    small, _, K_small = to_grid(image, [], tensor(K)[0], 24 * 32)
+    small, _, K_small = to_grid(PosedViews(image, (), tensor(K)[0]), 24 * 32)
     assert small.shape[-2:] == (24, 32)
     np.testing.assert_allclose(K_small, geometry.resize_intrinsics(tensor(K), SIZE, (24, 32))[0])
     twice = tensor(K)[0] * torch.tensor([2.0, 2.0, 1.0]).view(3, 1)
@@ -44,21 +44,23 @@ def test_the_sweep_and_all_that_is_made_of_it():
     T = torch.eye(4)
     T[0, 3] = -0.15
     left, camera = image(K, 0.0), torch.from_numpy(K).float()
-    rights = [CameraView(image(K_RIGHT, 0.15), torch.from_numpy(K_RIGHT).float(), T)]
-    grey = [rights[0]._replace(image_01=rights[0].image_01.mean(0, keepdim=True))]
+    right = CameraView(image(K_RIGHT, 0.15), torch.from_numpy(K_RIGHT).float(), T)
+    posed = PosedViews(left, (right,), camera)
+    grey_right = right._replace(image_01=right.image_01.mean(0, keepdim=True))
+    grey = PosedViews(left.mean(0, keepdim=True), (grey_right,), camera)
     planes = torch.linspace(0.2, 1.0, 24)
     volumes = (
-        pilot_volume(left, rights, camera),
-        build_cost_volume(left, rights, camera),
-        sweep_planes(left.mean(0, keepdim=True), grey, camera, planes),
+        pilot_volume(posed),
+        build_cost_volume(posed),
+        sweep_planes(grey, planes),
     )
     config = GuidanceConfig().changed(sweep_pixels=36 * 48)
-    evidence = prepare_evidence(PosedViews(left, tuple(rights), camera), None, config, needs_matches=True)
+    evidence = prepare_evidence(posed, None, config)
     for matches in (*(match_volume(v) for v in volumes), evidence.matches):
         reliable = matches.confidence > 0.5
         assert reliable.float().mean() > 0.3
         assert float((1 / matches.inverse_depth[reliable]).median()) == pytest.approx(2.0, rel=0.04)
-    assert not inverse_pose_preferred(left, rights, camera)
+    assert not inverse_pose_preferred(posed)
     small = geometry.resize_intrinsics(tensor(K), SIZE, (36, 48))[0]
     np.testing.assert_allclose(evidence.grid.K_left, small, rtol=1e-6)
 

@@ -30,7 +30,7 @@ from geodiff_plugin.formats import as_image_01, read_depth_png
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.matching import CostVolume, build_cost_volume, match_volume
 from geodiff_plugin.matching.rows import PARAMETERS, fill_background, make_matcher, pad_columns
-from geodiff_plugin.types import CameraView
+from geodiff_plugin.types import CameraView, PosedViews
 
 
 def sweep(sample: StereoSample, device: str, views: int = 2) -> CostVolume:
@@ -40,11 +40,12 @@ def sweep(sample: StereoSample, device: str, views: int = 2) -> CostVolume:
         return torch.as_tensor(x, dtype=torch.float32, device=device)
 
     given = ((sample.right, sample.K_right, sample.E), *sample.extra_views)[: views - 1]
-    rights = [
+    rights = (
         CameraView(as_image_01(image, "right").to(device), moved(K), moved(np.linalg.inv(E)))
         for image, K, E in given
-    ]
-    return build_cost_volume(as_image_01(sample.left, "left").to(device), rights, moved(sample.K_left))
+    )
+    left_01 = as_image_01(sample.left, "left").to(device)
+    return build_cost_volume(PosedViews(left_01, tuple(rights), moved(sample.K_left)))
 
 
 #: Largest shift that is tried, as a share of the image width.
