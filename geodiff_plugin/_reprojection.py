@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,22 +26,15 @@ STEPS = 3
 FARTHEST_STEP = 0.05
 
 
-@dataclass(frozen=True, eq=False)
-class TargetCamera:
-    """The camera that depth is wanted in.
+class PosedCamera(NamedTuple):
+    """A camera beside the left one, which has the depth."""
 
-    Attributes:
-        K: ``(3, 3)`` pixels, the first pixel's centre at (0, 0).
-        E: ``(4, 4)`` its pose in the frame of the camera that has the depth, in OpenCV's axes.
-        size: ``(width, height)`` of its image.
-    """
-
-    K: np.ndarray
-    E: np.ndarray
-    size: tuple[int, int]
+    K: np.ndarray  # (3, 3) pixels, the first pixel's centre at (0, 0)
+    E: np.ndarray  # (4, 4) its pose in the left camera's frame, in OpenCV's axes
+    size: tuple[int, int]  # (width, height) of its image
 
     @classmethod
-    def checked(cls, K: Any, E: Any, size: Any, of: str = "into") -> TargetCamera:
+    def checked(cls, K: Any, E: Any, size: Any, of: str = "into") -> PosedCamera:
         """The camera of arguments that a user gave; ``InputError`` names them after ``of``."""
         if size is None:
             bad_type(f"{of}: size", "a pair (width, height)", size)
@@ -52,7 +44,7 @@ class TargetCamera:
         return cls(check_intrinsics(K, f"{of}: K"), check_pose(E, f"{of}: E", pose), width_height)
 
 
-def depth_in_camera(depth: np.ndarray, K: np.ndarray, camera: TargetCamera) -> np.ndarray:
+def depth_in_camera(depth: np.ndarray, K: np.ndarray, camera: PosedCamera) -> np.ndarray:
     """Depth ``(h, w)`` float32 along z of another camera, in the same unit; 0 where there is none.
 
     Every cell of four pixels of ``depth (H, W)`` that lie on one surface (``JUMP``) is one, so that a finer
@@ -87,7 +79,7 @@ def _is_surface(*corners: np.ndarray) -> np.ndarray:
 
 
 def _samples(
-    inverse: np.ndarray, rows: slice, K: np.ndarray, camera: TargetCamera
+    inverse: np.ndarray, rows: slice, K: np.ndarray, camera: PosedCamera
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Columns, rows and depths in the other camera: of every known pixel of a strip, and within its cells."""
     strip = inverse[rows.start : rows.stop + 1]  # with the row below, which its last cells need
@@ -110,7 +102,7 @@ def _samples(
 
 
 def _samples_a_side(
-    x: np.ndarray, y: np.ndarray, corners: list[np.ndarray], K: np.ndarray, camera: TargetCamera
+    x: np.ndarray, y: np.ndarray, corners: list[np.ndarray], K: np.ndarray, camera: PosedCamera
 ) -> int:
     """So many samples along a side of a cell that no pixel of the other camera between them stays empty."""
     u, v, z = _seen(x, y, corners[0], K, camera)
@@ -124,7 +116,7 @@ def _samples_a_side(
 
 
 def _seen(
-    x: np.ndarray, y: np.ndarray, inverse: np.ndarray, K: np.ndarray, camera: TargetCamera
+    x: np.ndarray, y: np.ndarray, inverse: np.ndarray, K: np.ndarray, camera: PosedCamera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Column, row and depth in the other camera of pixels ``(n,)`` of the first, by their inverse depth."""
     rays = np.linalg.inv(K) @ np.stack([x, y, np.ones(len(x))])
@@ -135,7 +127,7 @@ def _seen(
 
 
 def _at_centres(
-    seen: np.ndarray, top: int, inverse: np.ndarray, K: np.ndarray, camera: TargetCamera
+    seen: np.ndarray, top: int, inverse: np.ndarray, K: np.ndarray, camera: PosedCamera
 ) -> np.ndarray:
     """A strip of the z-buffer with each depth moved from its sample to the centre of the pixel.
 

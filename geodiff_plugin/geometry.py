@@ -6,6 +6,7 @@ comment says why it is not used.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -53,6 +54,17 @@ def resize_intrinsics(K: Tensor, size_from: tuple[int, int], size_to: tuple[int,
     return to_device_of(K, resized)
 
 
+def scaled_size(size: tuple[int, int], rows: float, columns: float) -> tuple[int, int]:
+    """A size ``(H, W)`` times a factor for each axis, a pixel at least."""
+    return max(1, round(size[0] * rows)), max(1, round(size[1] * columns))
+
+
+def size_within(size: tuple[int, int], most_pixels: int) -> tuple[int, int]:
+    """A size ``(H, W)``, smaller by one factor for both axes where it has more than ``most_pixels``."""
+    factor = min(1.0, math.sqrt(most_pixels / (size[0] * size[1])))
+    return scaled_size(size, factor, factor)
+
+
 def resize_image(image_01: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """An image ``(C, H, W)`` at another ``size`` (antialiased), and the ``K (3, 3)`` that belongs to it."""
     before = image_size(image_01)
@@ -68,10 +80,9 @@ def as_fine_as(image_01: Tensor, K: Tensor, K_left: Tensor) -> tuple[Tensor, Ten
     Then neither image aliases in the other. Each axis has its own factor: rounding to whole pixels changes
     them differently, and a rectified pair must stay rectified.
     """
-    height, width = image_size(image_01)
     focal_left, focal = (each.numpy(force=True).diagonal() for each in (K_left, K))
     columns, rows, _ = np.minimum(focal_left / focal, 1.0).tolist()
-    return resize_image(image_01, K, (max(1, round(height * rows)), max(1, round(width * columns))))
+    return resize_image(image_01, K, scaled_size(image_size(image_01), rows, columns))
 
 
 def is_rectified(K_left: Tensor, K_right: Tensor, T_right_from_left: Tensor) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from diffusers.utils import BaseOutput
 
-from geodiff_plugin._reprojection import TargetCamera, depth_in_camera
+from geodiff_plugin._reprojection import PosedCamera, depth_in_camera
 from geodiff_plugin.messages import Message
 
 #: Why a depth is not judged.
@@ -166,9 +166,7 @@ class Indicators:
     given_px: float = math.nan  # the same distance under the poses as given
     scale_spread: float = math.nan  # relative standard deviation of a refined pose's scale, if in metres
     depth_spread: float = math.nan  # median change of log depth by another pose that fits as well
-    straightened_px: float = (
-        math.nan
-    )  # root mean square by which no pose explains the matches, the worst view's
+    straightened_px: float = math.nan  # root mean square that no pose explains, the worst view's
     behind_infinity: float = math.nan  # share of the matches at which the two cameras' rays diverge
     behind_px: float = math.nan  # how far behind infinity the farthest lie, pixels of the left image
     distortion: float = math.nan  # k1 that both pictures still have for certain
@@ -323,7 +321,7 @@ class MetricDepthOutput(BaseOutput):
         Raises:
             InputError: a K, E or size that is none.
         """
-        camera = TargetCamera.checked(K, E, size)
+        camera = PosedCamera.checked(K, E, size)
         if self.K is None:
             raise AttributeError("This output has no K: no guided call made it.")
         Ks = self.K if isinstance(self.K, np.ndarray) else self.K.numpy(force=True)

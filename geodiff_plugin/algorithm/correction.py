@@ -272,10 +272,18 @@ def prior_error(
     return error**share * MOST_ERROR ** (1.0 - share)
 
 
+class DepthFit(NamedTuple):
+    """A map that was fitted to matches and points, and how."""
+
+    depth_m: Tensor  # (B, 1, H, W) metres
+    support: Tensor  # (B, 1, H, W) in [0, 1], how far the matches determine it
+    correction: Tensor  # (B, 1, h, w) on the grid of the matches, by which the log of depth was lowered
+
+
 @torch.no_grad()
 def fit_depth(
     depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor, config: GuidanceConfig = DEFAULT
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> DepthFit:
     """Least-squares correction of log depth that follows matches and stops at edges.
 
     With ``u`` the correction and ``r`` the residual of each match after earlier passes, a pass goes towards
@@ -292,9 +300,6 @@ def fit_depth(
         left_01: ``(B, 3, h, w)`` in [0, 1], the left images at any resolution.
         error: ``prior_error`` or ``local_error``; matches that contradict a good prior count for less.
         config: the fit's numbers.
-
-    Returns:
-        The fitted depth; its support in [0, 1], how far matches determine it; ``u`` on their grid.
     """
     observed = _observations(depth_m, target, left_01, config)
     error = _on_grid(error, target.size)
@@ -309,7 +314,7 @@ def fit_depth(
         for field in (total, decided)
     )
     refined_m = depth_m.float() * torch.exp(-change)
-    return refined_m.to(depth_m.dtype), support.clamp(0.0, 1.0), total
+    return DepthFit(refined_m.to(depth_m.dtype), support.clamp(0.0, 1.0), total)
 
 
 def _levels(error: Tensor, config: GuidanceConfig) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from geodiff_plugin.algorithm.correction import fit_depth, prior_error
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.geometry import scaled_size
 from geodiff_plugin.matching import Matches, with_points
 
 #: Longer side of the depth prompt, pixels: such networks were trained with maps of a phone's lidar.
@@ -30,10 +31,9 @@ def _prompt_of(evidence: Evidence, config: GuidanceConfig) -> Tensor | None:
     target = confident if points is None else with_points(confident, points)
     if target is None:
         return None
-    height, width = evidence.grid.size
-    factor = min(1.0, PROMPT_LONG_EDGE / max(height, width))
-    size = max(1, round(height * factor)), max(1, round(width * factor))
+    size = evidence.grid.size
+    factor = min(1.0, PROMPT_LONG_EDGE / max(size))
     median = 1.0 / target.inverse_depth[target.confidence > 0].median()
-    flat, left = median.expand(1, 1, height, width), evidence.grid.left_01[None]
-    depth_m, _, _ = fit_depth(flat, target, left, prior_error(flat, target, left, config), config)
-    return F.interpolate(depth_m, size, mode="bilinear", antialias=True)
+    flat, left = median.expand(1, 1, *size), evidence.grid.left_01[None]
+    fit = fit_depth(flat, target, left, prior_error(flat, target, left, config), config)
+    return F.interpolate(fit.depth_m, scaled_size(size, factor, factor), mode="bilinear", antialias=True)

@@ -61,6 +61,7 @@ def fit_depth_range(
     shows up. Only pixels that are ``valid (1, 1, h, w)`` are compared.
     """
     space, floored, reliable = metric.space, smooth_floor(x), evidence.reliable
+    on_edge: Tensor | None
     if evidence.volume is None:
         assert evidence.points is not None  # without views there are points
         near, far = fit_to_points(x, evidence.points, metric, None if current is None else current[:2])
@@ -69,11 +70,9 @@ def fit_depth_range(
         # Later steps start from the first one's range; reliable matches show if that basin is still best.
         near, far, on_edge = current.near_m, current.far_m, current.on_edge
     else:
-        near, far, searched = search_scale(
+        near, far, on_edge = search_scale(
             evidence.volume, floored, space, depth_range=config.depth_range, current=current, valid=valid
         )
-        assert searched is not None  # of a search
-        on_edge = searched
     if reliable is not None and evidence.matches is not None:
         # A poor prior's true basin is shallow in raw costs; matches separate basins at that error.
         near, far = refine_to_matches(floored, evidence.matches, near, far, space)

@@ -187,10 +187,10 @@ class Trajectory:
         target, error = self._target(depth_m), local_error(self.error, self.maps.valid)
         if target is None or error is None:
             return x
-        _, _, field = fit_depth(depth_m, target, self.objective.views.left_01, error, self.config)
+        fit = fit_depth(depth_m, target, self.objective.views.left_01, error, self.config)
         # Resample the factor, not the difference of maps, which would be wrong on both sides of an edge.
-        field = F.interpolate(field, x.shape[-2:], mode="bilinear", antialias=True)
-        return self.metric.relative(self.metric(x, self.affine) * torch.exp(-field), self.affine)
+        change = F.interpolate(fit.correction, x.shape[-2:], mode="bilinear", antialias=True)
+        return self.metric.relative(self.metric(x, self.affine) * torch.exp(-change), self.affine)
 
     def loss(self, x: Tensor, affine: AffineState, z0: Tensor, anchor: Tensor) -> Loss:
         """Loss of an estimate ``x``, decoded from ``z0``, whose scale is settled; as ``Objective``."""
@@ -218,26 +218,22 @@ class Trajectory:
     def members(self, x: Tensor, depth_m: Tensor) -> list[Member]:
         """What act 3 gets of every sample: of the maps ``x`` without padding, and of their ``result``."""
         near_m, far_m = depth_m.amin((1, 2, 3), keepdim=True), depth_m.amax((1, 2, 3), keepdim=True)
-        members = []
-        for i in range(len(self.evidence)):
-            of_sample = slice(i, i + 1)
-
-            def part(values: Tensor | None, of_sample: slice = of_sample) -> Tensor | None:
-                return None if values is None else values[of_sample]
-
-            members.append(
-                Member(
-                    self.metric,
-                    self.affine.of(of_sample),
-                    relative=x[of_sample],
-                    near_m=near_m[of_sample],
-                    far_m=far_m[of_sample],
-                    reflection_weight=part(self.reflection_weight),
-                    error=part(self.error),
-                    valid=part(self.maps.valid),
-                    rank_correlation=part(self.rank_correlation),
-                    on_edge=part(self.on_edge),
-                    prior_depth_m=part(self.prior_depth_m),
-                )
+        measured = {
+            "reflection_weight": self.reflection_weight,
+            "error": self.error,
+            "valid": self.maps.valid,
+            "rank_correlation": self.rank_correlation,
+            "on_edge": self.on_edge,
+            "prior_depth_m": self.prior_depth_m,
+        }
+        return [
+            Member(
+                self.metric,
+                self.affine.of(sample),
+                relative=x[sample],
+                near_m=near_m[sample],
+                far_m=far_m[sample],
+                **{name: None if values is None else values[sample] for name, values in measured.items()},
             )
-        return members
+            for sample in (slice(i, i + 1) for i in range(len(self.evidence)))
+        ]

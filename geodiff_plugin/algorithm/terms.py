@@ -300,9 +300,19 @@ class Objective:
         with torch.set_grad_enabled(torch.is_grad_enabled() and warps):
             warped_01, in_view = self._warp(depth_m)
         visible = in_view if given.hidden is None else in_view & ~given.hidden
-        seen = depth_m, self.views.left_01, warped_01, visible
-        latents = given.affine, given.affine_start, given.z0, given.anchor
-        compared = Compared(*seen, *latents, given.matches, given.points, self.config)
+        compared = Compared(
+            depth_m,
+            self.views.left_01,
+            warped_01,
+            visible,
+            affine=given.affine,
+            affine_start=given.affine_start,
+            z0=given.z0,
+            anchor=given.anchor,
+            matches=given.matches,
+            points=given.points,
+            config=self.config,
+        )
         visible_fraction = in_view.any(1).float().flatten(1).mean(1)
         total, values = torch.zeros_like(visible_fraction), {}
         for name, weight in active.items():

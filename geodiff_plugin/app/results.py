@@ -11,11 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO, StringIO
 from pathlib import Path
+from typing import Any
 from zipfile import ZIP_STORED, ZipFile
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from geodiff_plugin._reprojection import PosedCamera
 from geodiff_plugin.app import look
 from geodiff_plugin.app.shown import Pixels, Shown, kept_in_view
 from geodiff_plugin.formats.clouds import CAMERA_COLOURS, EDGES, PYRAMID_SHARE, camera_pyramid
@@ -73,6 +75,14 @@ def reading(shown: Shown, pixel: tuple[int, int]) -> Reading:
     return read_pixel(shown.depth_m, shown.K, (x, y), shown.confidence, shown.uncertainty_m)
 
 
+def _drawn_camera(number: int, view: PosedCamera, length_m: float) -> dict[str, Any]:
+    """The edges of a camera's pyramid in WebGL's axes, and its colour."""
+    corners = camera_pyramid(view.K, view.E, view.size, length_m)
+    edges = (corners[EDGES] * (1.0, -1.0, -1.0)).reshape(-1, 3)
+    colour = [value / 255 for value in CAMERA_COLOURS[number % len(CAMERA_COLOURS)]]
+    return {"edges": edges.round(4).tolist(), "colour": colour}
+
+
 def scene_data(shown: Shown) -> str:
     """What ``viewer.js`` draws, as JSON: a thinned grid of depth and confidence, photograph and cameras."""
     height, width = shown.depth_m.shape
@@ -84,12 +94,7 @@ def scene_data(shown: Shown) -> str:
     photograph = picture(shown, "photograph")
     assert photograph is not None
     length_m = PYRAMID_SHARE * float(np.median(z[z > 0])) if (z > 0).any() else 1.0
-    cameras = []
-    for number, view in enumerate(shown.views):
-        corners = camera_pyramid(view.K, view.E, view.size, length_m)
-        edges = (corners[EDGES] * (1.0, -1.0, -1.0)).reshape(-1, 3)
-        colour = [value / 255 for value in CAMERA_COLOURS[number % len(CAMERA_COLOURS)]]
-        cameras.append({"edges": edges.round(4).tolist(), "colour": colour})
+    cameras = [_drawn_camera(number, view, length_m) for number, view in enumerate(shown.views)]
     lens = {"fx": shown.K[0, 0], "fy": shown.K[1, 1], "cx": shown.K[0, 2], "cy": shown.K[1, 2]}
     size = {"width": width, "height": height, "w": z.shape[1], "h": z.shape[0], "stride": stride}
     encoded = b64encode(zlib.compress(maps, 9)).decode()

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geodiff_plugin._reprojection import PosedCamera
 from geodiff_plugin.formats import read_image
 from geodiff_plugin.formats.clouds import flying_points, in_8_bits
 from geodiff_plugin.formats.out import REPORT
@@ -28,15 +29,6 @@ BEYOND_FAR = 1.3
 
 
 @dataclass(frozen=True)
-class View:
-    """A camera: ``K`` ``(3, 3)`` pixels, ``E`` ``(4, 4)`` its pose in the left one's frame, and its image."""
-
-    K: np.ndarray
-    E: np.ndarray
-    size: tuple[int, int]
-
-
-@dataclass(frozen=True)
 class Figure:
     """A number of the banner, and what it is."""
 
@@ -50,7 +42,7 @@ class Shown:
 
     photograph: np.ndarray  # (H, W, 3) uint8
     depth_m: np.ndarray  # float32
-    views: tuple[View, ...]
+    views: tuple[PosedCamera, ...]
     standing: Standing
     messages: tuple[Message, ...]  # beside those of the standing
     figures: tuple[Figure, ...]
@@ -84,7 +76,7 @@ def shown_of(job: PairResult) -> Shown:
     return Shown(
         photograph=in_8_bits(inputs.left),
         depth_m=single_map(output.prediction).astype(np.float32),
-        views=tuple(View(*camera) for camera in cameras_of(output, inputs.guidance)),
+        views=cameras_of(output, inputs.guidance),
         standing=standing,
         messages=tuple(m for m in messages if m not in (*standing.reasons, *summed_up)),
         figures=_figures(job),
@@ -165,7 +157,7 @@ def load(path: Path, photograph: Path, title: str) -> tuple[Shown, Pixels]:
     shown = Shown(
         photograph=in_8_bits(read_image(photograph)[0]),
         depth_m=depth_m,
-        views=tuple(View(np.array(K), np.array(E), tuple(size)) for K, E, size in words["views"]),
+        views=tuple(PosedCamera(np.array(K), np.array(E), tuple(size)) for K, E, size in words["views"]),
         standing=Standing(status, Tone(tone), said, _messages(words["reasons"])),
         messages=_messages(words["messages"]),
         figures=tuple(Figure(*figure) for figure in words["figures"]),

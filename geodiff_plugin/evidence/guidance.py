@@ -206,8 +206,8 @@ class GeometryGuidance:
             If the first pose is the identity, the others are poses in the left camera's frame.
         """
         with noted() as warned:
-            left_size, images, Ks, Es = split_views(views, cropped=arguments.get("cropped", False))
-            guidance = cls(images, Ks, Es, **{"left_size": left_size} | arguments)
+            split = split_views(views, cropped=arguments.get("cropped", False))
+            guidance = cls(split.rights, split.Ks, split.Es, **{"left_size": split.left_size} | arguments)
         guidance.warned = warned
         return guidance
 

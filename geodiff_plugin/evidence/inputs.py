@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -229,10 +229,17 @@ def _as_confidence(value: Any, points: np.ndarray, name: str) -> np.ndarray:
     return array
 
 
-def split_views(
-    views: Any, *, cropped: bool = False
-) -> tuple[tuple[int, int] | None, tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
-    """Views of ``from_views``, left one first: its size, the right images, all K's and E's."""
+class SplitViews(NamedTuple):
+    """Views of ``from_views``, of which the first is the left one, as the constructor takes them."""
+
+    left_size: tuple[int, int] | None  # (width, height); ``None`` without a left image
+    rights: tuple[Any, ...]
+    Ks: tuple[Any, ...]  # of all views
+    Es: tuple[Any, ...]
+
+
+def split_views(views: Any, *, cropped: bool = False) -> SplitViews:
+    """Views of ``from_views``, checked as far as the left one's K can be."""
     form = "a list [(image, K, E), ...] with the left view first"
     if not isinstance(views, (list, tuple)):
         bad_type("views", form, views)
@@ -241,14 +248,14 @@ def split_views(
         bad_value("views", form, f"{len(views)} entries of lengths {kinds}", "Three values each.")
     images, Ks, Es = (tuple(column) for column in zip(*views, strict=True))
     if images[0] is None:
-        return None, images[1:], Ks, Es
+        return SplitViews(None, images[1:], Ks, Es)
     width, height = picture_size(images[0], "the left view's image")
     K_left = check_intrinsics(Ks[0], "K[left]")
     if not cropped:
         check_intrinsics_fit(K_left, width, height, "K[left]", "the left view's image")
     if isinstance(images[0], Image.Image):
         warn_of_other_lens(images[0], K_left, "the left view's image")
-    return (width, height), images[1:], Ks, Es
+    return SplitViews((width, height), images[1:], Ks, Es)
 
 
 def left_images(image: Any) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,14 +14,22 @@ from geodiff_plugin.evidence.inputs import Inputs
 from geodiff_plugin.evidence.prepare import make_evidence
 
 
+class _Entry(NamedTuple):
+    """Evidence, what it was made from, and how long that took."""
+
+    tensors: list[Tensor | None]
+    settings: tuple[Any, ...]
+    evidence: Evidence
+    seconds: float
+
+
 class EvidenceStore:
     """A cache of evidence by the values that it was made from; several guidances may share it."""
 
     def __init__(self, size: int = 2, copies: bool = True) -> None:
         """Keep the last ``size`` images, some 100 MB each; without ``copies`` they must not be changed."""
         self._size, self._copies, self._spared = size, copies, 0.0
-        # Tensors and settings that an entry was made from, the entry, and the seconds that it took.
-        self._entries: list[tuple[list[Tensor | None], tuple[Any, ...], Evidence, float]] = []
+        self._entries: list[_Entry] = []
 
     def get(
         self,
@@ -37,15 +45,16 @@ class EvidenceStore:
         needs_matches = config.needs_matches(given.points is not None)
         settings = (*(getattr(config, name) for name in knobs), config.search == "volume")
         settings = (*settings, needs_matches, measured_baseline, given.unit)
-        for held, made_with, evidence, seconds in self._entries:
-            if made_with == settings and len(held) == len(tensors) and all(map(_equal, held, tensors)):
-                self._spared += seconds
-                return evidence
+        for entry in self._entries:
+            as_many = entry.settings == settings and len(entry.tensors) == len(tensors)
+            if as_many and all(map(_equal, entry.tensors, tensors)):
+                self._spared += entry.seconds
+                return entry.evidence
         start = time.perf_counter()
         evidence = make_evidence(left_01, given, config, measured_baseline)
         # Copies, so that an image that was changed in place since is not taken for the same.
         held = [value.clone() if self._copies and value is not None else value for value in tensors]
-        self._entries.insert(0, (held, settings, evidence, time.perf_counter() - start))
+        self._entries.insert(0, _Entry(held, settings, evidence, time.perf_counter() - start))
         del self._entries[self._size :]
         return evidence
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin._reprojection import TargetCamera
+from geodiff_plugin._reprojection import PosedCamera
 from geodiff_plugin.formats.files import PathLike, read_text
 
 NEEDED = ("K", "E", "width", "height")
@@ -26,7 +26,7 @@ def _read(path: PathLike) -> dict[str, object]:
     return said
 
 
-def read_target_camera(path: PathLike) -> TargetCamera:
+def read_target_camera(path: PathLike) -> PosedCamera:
     """``K (3, 3)`` pixels, ``E (4, 4)`` pose in the left camera's frame, ``width`` and ``height`` of a file.
 
     E is camera-to-world with the left camera as the world, OpenCV's axes, metres, as everywhere here.
@@ -35,7 +35,7 @@ def read_target_camera(path: PathLike) -> TargetCamera:
         InputError: a file that is no such JSON, or whose camera is none.
     """
     said = _read(path)
-    return TargetCamera.checked(said["K"], said["E"], (said["width"], said["height"]), "--into")
+    return PosedCamera.checked(said["K"], said["E"], (said["width"], said["height"]), "--into")
 
 
 def frame_of_target(path: PathLike) -> str:

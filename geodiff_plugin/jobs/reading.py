@@ -132,7 +132,7 @@ def _cameras_with_poses(
     if of_files:
         for K, (name, path) in zip((rig.K_left, rig.K_right), options.photographs().items(), strict=False):
             warn_of_other_lens(path, K, name)
-    further = [_matrix(path, "--view-K") for path in options.view_k] or [rig.K_left] * len(options.view)
+    further = [_read_view_K(path) for path in options.view_k] or [rig.K_left] * len(options.view)
     poses = (check_pose(read_matrix(path, "--view-E"), f"--view-E {path}") for path in options.view_e)
     return _Cameras([rig.K_left, rig.K_right, *further][: len(sizes)], rig, (np.eye(4), rig.E, *poses))
 
@@ -225,8 +225,8 @@ def read_rig(
         rig = replace(rig, E=np.eye(4)) if options.baseline is None else rig
     else:
         assert options.k is not None
-        K = _matrix(options.k, "--K")
-        K_right = K if options.k_right is None else _matrix(options.k_right, "--K-right")
+        K = _read_K(options.k, "--K")
+        K_right = K if options.k_right is None else _read_K(options.k_right, "--K-right")
         E = np.eye(4) if options.e is None else check_pose(read_matrix(options.e, "--E"), "--E")
         rig = Rig(K, K_right, E, source=str(options.k), measured=options.e is None)
     cure = "Use the images that it is for, or scale K with them and give --fx --fy --cx --cy."
@@ -237,8 +237,14 @@ def read_rig(
     return replace(rig, size_left=left_size, size_right=right_size)
 
 
-def _matrix(path: Path, option: str) -> np.ndarray:
-    return check_intrinsics(read_matrix(path, option), f"{option} {path}" if "view" in option else option)
+def _read_K(path: Path, option: str, name: str | None = None) -> np.ndarray:
+    """The K in the file of an option, checked; errors call it ``name``, by default as the option."""
+    return check_intrinsics(read_matrix(path, option), name or option)
+
+
+def _read_view_K(path: Path) -> np.ndarray:
+    """The same of ``--view-K``, which may be repeated: errors say which file is meant."""
+    return _read_K(path, "--view-K", f"--view-K {path}")
 
 
 def _intrinsics(
@@ -246,11 +252,11 @@ def _intrinsics(
 ) -> np.ndarray:
     """K of photograph ``i`` without a pose, 0 being the left one, from the options, else from its EXIF."""
     if i > 1 and options.view_k:
-        return _matrix(options.view_k[i - 2], "--view-K")
+        return _read_view_K(options.view_k[i - 2])
     if i > 0 and options.k_right is not None:
-        return _matrix(options.k_right, "--K-right")
+        return _read_K(options.k_right, "--K-right")
     if options.k is not None:
-        return _matrix(options.k, "--K")
+        return _read_K(options.k, "--K")
     if way == "parameters":
         notes += _filled_in(options)
         return intrinsics(*_lens_of(options, size))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
 
 from geodiff_plugin import formats, plotting
-from geodiff_plugin._reprojection import depth_in_camera
+from geodiff_plugin._reprojection import PosedCamera, depth_in_camera
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats.target import read_target_camera
 from geodiff_plugin.jobs.options import DepthOptions, unique_names
@@ -72,25 +72,30 @@ def write_undistorted(folder: Path, image_01: np.ndarray, number: int = 1) -> st
     return name
 
 
-def cameras_of(
-    output: MetricDepthOutput, guidance: GeometryGuidance
-) -> tuple[tuple[np.ndarray, np.ndarray, tuple[int, int]], ...]:
-    """``(K, E, (width, height))`` of every view of one image, left one first; poses as the call used them."""
+def cameras_of(output: MetricDepthOutput, guidance: GeometryGuidance) -> tuple[PosedCamera, ...]:
+    """The camera of every view of one image, left one first; poses as the call used them."""
     depth_m, K = single_map(output.prediction), np.asarray(output.K)[0].astype(np.float64)
     further = zip(guidance.rigs, used_poses(output, guidance), guidance.rights, strict=True)
-    rights = ((rig.K_right, E, (image.shape[-1], image.shape[-2])) for rig, E, image in further)
-    return ((K, np.eye(4), (depth_m.shape[1], depth_m.shape[0])), *rights)
+    rights = (PosedCamera(rig.K_right, E, (image.shape[-1], image.shape[-2])) for rig, E, image in further)
+    return (PosedCamera(K, np.eye(4), (depth_m.shape[1], depth_m.shape[0])), *rights)
 
 
-def pixels_of(
-    output: MetricDepthOutput, left: np.ndarray, least_confidence: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What ``make_cloud`` and ``make_mesh`` take: valid pixels of this confidence or more that do not fly."""
+class ShownPixels(NamedTuple):
+    """What ``make_cloud`` and ``make_mesh`` take."""
+
+    depth_m: np.ndarray  # (H, W)
+    image_01: np.ndarray  # (H, W, 3)
+    K: np.ndarray  # (3, 3)
+    valid: np.ndarray  # (H, W) bool, the pixels to be shown
+
+
+def pixels_of(output: MetricDepthOutput, left: np.ndarray, least_confidence: float) -> ShownPixels:
+    """The pixels of a result that a cloud shows: valid ones of this confidence or more that do not fly."""
     depth_m = single_map(output.prediction)
     keep = single_map(output.valid) & ~formats.flying_points(depth_m)
     if output.confidence is not None:
         keep &= single_map(output.confidence) >= least_confidence
-    return depth_m, left, np.asarray(output.K)[0].astype(np.float64), keep
+    return ShownPixels(depth_m, left, np.asarray(output.K)[0].astype(np.float64), keep)
 
 
 def write_exports(folder: Path, output: MetricDepthOutput, inputs: PairInputs, options: DepthOptions) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.geometry import as_fine_as, resize_image
+from geodiff_plugin.geometry import as_fine_as, resize_image, size_within
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches
@@ -52,10 +52,7 @@ _ENOUGH_MATCHED = 0.4
 
 def to_grid(posed: PosedViews, pixels: int) -> PosedViews:
     """The views with a left image of at most ``pixels``, and right ones as fine as that."""
-    height, width = posed.size
-    factor = min(1.0, (pixels / (height * width)) ** 0.5)
-    size = max(1, round(height * factor)), max(1, round(width * factor))
-    left, K = resize_image(posed.left_01, posed.K_left, size)
+    left, K = resize_image(posed.left_01, posed.K_left, size_within(posed.size, pixels))
     rights = tuple(CameraView(*as_fine_as(image, K_r, K), T) for image, K_r, T in posed.views)
     return PosedViews(left, rights, K)
 

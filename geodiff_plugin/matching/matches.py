@@ -52,9 +52,7 @@ class Matches:
     inverse_depth: Tensor  # float32, 1/m; defined everywhere, to be read where ``confidence > 0``
     confidence: Tensor  # 0 where nothing is matched or known
     plane_step: Tensor  # () or (B,) 1/m, the unit of errors: a plane, or ``UNIT`` of the points' median
-    deviation: Tensor | None = (
-        None  # like ``confidence``, of a match in plane steps; ``None`` is 1 everywhere
-    )
+    deviation: Tensor | None = None  # like ``confidence``, in plane steps; ``None`` is 1 everywhere
     _above: dict[float, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @classmethod

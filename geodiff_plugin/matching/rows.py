@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geodiff_plugin.geometry import image_size, is_rectified, resize_image, to_device_of
+from geodiff_plugin.geometry import image_size, is_rectified, resize_image, size_within, to_device_of
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.uprights import certain_shear
 from geodiff_plugin.types import CameraView, PosedViews
@@ -82,8 +82,7 @@ def fill_background(shift: np.ndarray) -> np.ndarray:
 
 def grid_of_rows(size: tuple[int, int]) -> tuple[int, int]:
     """``(H, W)`` of the grid for a picture or map of a size: the same, within ``MOST_PIXELS``."""
-    share = min(1.0, math.sqrt(MOST_PIXELS / (size[0] * size[1])))
-    return max(1, round(size[0] * share)), max(1, round(size[1] * share))
+    return size_within(size, MOST_PIXELS)
 
 
 def match_rectified(native: PosedViews, nearest: Tensor) -> RowMatches | None:
@@ -104,6 +103,22 @@ def match_rectified(native: PosedViews, nearest: Tensor) -> RowMatches | None:
     return match_rows(left, right, K, float(nearest) * focal_baseline)
 
 
+def _row_shifts(
+    left: np.ndarray, right: np.ndarray, infinity_px: float, nearest_px: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Shifts of grey levels ``(H, W)`` uint8 from infinity, float32 px, and where both views agree on one.
+
+    A point at infinity has the disparity ``infinity_px``; the search goes from there to ``nearest_px`` more.
+    """
+    lowest = int(np.floor(infinity_px))
+    count = 16 * max(1, int(np.ceil(min(nearest_px + 4.0, MAX_SHIFT * left.shape[1]) / 16)))
+    pad = max(0, lowest + count)
+    matcher = make_matcher(lowest, count, 1)
+    raw = matcher.compute(pad_columns(left, pad), pad_columns(right, pad))[:, pad:]
+    shift = raw.astype(np.float32) / 16.0 - np.float32(infinity_px)
+    return shift, (raw > 16 * (lowest - 1)) & (shift >= MIN_SHIFT_PX)
+
+
 def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: float) -> RowMatches:
     """Match a rectified pair of one size, ``left_01 (3, H, W)`` in [0, 1] and ``view`` on either side.
 
@@ -116,16 +131,9 @@ def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: fl
     mirrored = T[0, 3] > 0
     if mirrored:  # mirrored, a view to the left becomes one to the right
         images, infinity = [image[:, ::-1] for image in images], -infinity
-    width = images[0].shape[1]
-    lowest = int(np.floor(infinity))
-    count = 16 * max(1, int(np.ceil(min(nearest_px + 4.0, MAX_SHIFT * width) / 16)))
-    pad = max(0, lowest + count)
-    left, right = (pad_columns(image, pad) for image in images)
-    raw = make_matcher(lowest, count, 1).compute(left, right)[:, pad:]
-    shift = raw.astype(np.float32) / 16.0 - np.float32(infinity)
-    known = (raw > 16 * (lowest - 1)) & (shift >= MIN_SHIFT_PX)
-    between = np.logical_or.accumulate(known, 1) & np.logical_or.accumulate(known[:, ::-1], 1)[:, ::-1]
+    shift, known = _row_shifts(images[0], images[1], infinity, nearest_px)
     shear = certain_shear(np.ascontiguousarray(images[0]), shift, known)
+    between = np.logical_or.accumulate(known, 1) & np.logical_or.accumulate(known[:, ::-1], 1)[:, ::-1]
     shift = np.nan_to_num(fill_background(np.where(known, shift, np.float32(np.nan))))
     maps = np.stack([shift, known, between & ~known])
     shift_on, matched, filled = to_device_of(left_01, maps[..., ::-1] if mirrored else maps)

@@ -50,6 +50,13 @@ SECOND_OF_REST = 0.5
 RIVAL = 0.45
 # Robust scales of the last fits, pixels: only matches determine an estimated pose.
 _NARROWER_PX = (0.3, 0.15, 0.08)
+# Standard deviations of estimated poses before that fit: of their rotations, and of the cameras' centres as a
+# share of the baseline.
+_TURNED_RAD = np.radians(3.0)
+_SHIFTED = 0.3
+# Of the lengths of several baselines; a single one has no length of its own, and is held.
+_LONGER = 0.2
+_ONE_LONGER = 0.02
 # The depth of a pixel is that of the matches this near, pixels of their grid.
 _NEAR_PX = 40.0
 NO_UNIT = Message(
@@ -242,7 +249,8 @@ def polished(
     """
     Ts = Ts.astype(np.float32).astype(np.float64)  # the precision that the depth was made with
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, Ts)])
-    free = PosePrior(np.full(len(Ts), FREE_PX), np.radians(3.0), 0.3, 0.02 if len(Ts) == 1 else 0.2)
+    longer = _ONE_LONGER if len(Ts) == 1 else _LONGER
+    free = PosePrior(np.full(len(Ts), FREE_PX), _TURNED_RAD, _SHIFTED, longer)
     solved = Ts
     for scale_px in (SCALE_PX, *_NARROWER_PX):
         solved = solve_poses(tracks, Ts, free, start=solved, scale_px=scale_px)

@@ -214,8 +214,8 @@ def refine(
     target = correction_target(matches, points, weight, error, depth_m)
     if target is None or error is None:
         return None
-    fitted_m, of_fit, _ = fit_depth(depth_m, target, evidence.native.left_01[None], error, config)
-    support = of_fit
+    fit = fit_depth(depth_m, target, evidence.native.left_01[None], error, config)
+    fitted_m, support = fit.depth_m, fit.support
     if matches is not None:
         measured = error.amin((2, 3), keepdim=True)  # its value where the prior gives a depth
         target = correction_target(matches, points, weight, error, fitted_m)
@@ -223,8 +223,8 @@ def refine(
         known = known_share(target)
         fitted_m = vote_depth(fitted_m, evidence, target, known, measured, spacing)
         fitted_m = flatten(fitted_m, target, left_01, measured)
-        support = of_fit * determined(known, image_size(of_fit))
-    return Refined(fitted_m, support, grounds_of(denoised_m, fitted_m, target, of_fit))
+        support = fit.support * determined(known, image_size(fit.support))
+    return Refined(fitted_m, support, grounds_of(denoised_m, fitted_m, target, fit.support))
 
 
 def _member_at(size: tuple[int, int], member: Member, like: Tensor, options: ResultOptions) -> Tensor:

@@ -168,6 +168,7 @@ def median_kernel(
             below = tl.sum(tl.where(values <= value[:, None], counts, 0), 1)
             median = tl.minimum(median, tl.where(2 * below > _IN_MEDIAN, value, float("inf")))
     _at_edges, map_vote = _error_and_map_vote(error, crispness)
+    # The confidence of a known point is above 1; none is smoothed where the map outvotes its matches.
     most = tl.where(map_vote < 1.0, 1.0, -1.0)
     smoothed = tl.load(confidence + own) <= most
     tl.store(smooth + pixel, tl.where(smoothed, median, tl.load(voted + own)), exists)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from geodiff_plugin._reprojection import TargetCamera, depth_in_camera
+from geodiff_plugin._reprojection import PosedCamera, depth_in_camera
 from tests.cli.conftest import QUICK, report_of
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
@@ -25,7 +25,7 @@ def camera_file(folder, **changed):
 
 def expected_of(folder):
     depth_m, K = np.load(folder / "depth.npy"), np.reshape(report_of(folder)["K"], (3, 3))
-    return depth_in_camera(depth_m, K, TargetCamera(np.array(K_TO), np.array(E_TO), (80, 56)))
+    return depth_in_camera(depth_m, K, PosedCamera(np.array(K_TO), np.array(E_TO), (80, 56)))
 
 
 def check(folder):

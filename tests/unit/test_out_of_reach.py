@@ -7,7 +7,7 @@ import torch
 from PIL import Image
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin._reprojection import TargetCamera, depth_in_camera
+from geodiff_plugin._reprojection import PosedCamera, depth_in_camera
 from geodiff_plugin.capture.results import _write_agreed
 from geodiff_plugin.formats.points import read_ply_points
 from geodiff_plugin.jobs.bag import _valid_depth
@@ -58,7 +58,7 @@ def test_maps_stay_finite_and_everything_else_leaves_it_out(tmp_path):
 
 def test_another_camera_does_not_see_it():
     E, size = np.eye(4), (64, 48)
-    camera = TargetCamera.checked(K, E, size)
+    camera = PosedCamera.checked(K, E, size)
     unknown = np.where(output().valid, output().prediction, 0.0)[0, ..., 0]
     seen = output().into(K, E, size)[0, ..., 0]
     np.testing.assert_array_equal(seen, depth_in_camera(unknown, K, camera))

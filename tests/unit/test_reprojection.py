@@ -7,7 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import InputError, MetricDepthOutput
-from geodiff_plugin._reprojection import TargetCamera, depth_in_camera
+from geodiff_plugin._reprojection import PosedCamera, depth_in_camera
 
 K = np.array([[120.0, 0.5, 79.0], [0, 125.0, 58.0], [0, 0, 1]])
 SIZE = (160, 120)
@@ -52,7 +52,7 @@ CAMERAS = [
 @pytest.mark.parametrize(("K_to", "E", "size"), CAMERAS, ids=["same", "beside", "finer", "coarser"])
 def test_another_camera_sees_what_rays_hit(K_to, E, size):
     depth = cast(K, np.eye(4), SIZE)[0].astype(np.float32)
-    found = depth_in_camera(depth, K, TargetCamera(K_to, E, size))
+    found = depth_in_camera(depth, K, PosedCamera(K_to, E, size))
     truth, points = cast(K_to, E, size)
     assert found.shape == size[::-1] and found.dtype == np.float32
     pixels = points / points[..., 2:] @ K.T
@@ -71,7 +71,7 @@ def test_another_camera_sees_what_rays_hit(K_to, E, size):
 def test_what_the_left_camera_does_not_see_has_no_depth():
     depth = cast(K, np.eye(4), SIZE)[0]
     E = pose(at=(0.3, 0.0, 0.0))
-    found = depth_in_camera(depth, K, TargetCamera(K, E, SIZE))
+    found = depth_in_camera(depth, K, PosedCamera(K, E, SIZE))
     truth, points = cast(K, E, SIZE)
     behind = hidden(points) & (np.abs(np.abs((points * (2 / points[..., 2:]))[..., 0]) - 0.5) > 0.05)
     outside = (points / points[..., 2:] @ K.T)[..., 0] > SIZE[0] + 1
@@ -82,16 +82,16 @@ def test_what_the_left_camera_does_not_see_has_no_depth():
 def test_unknown_depth_stays_unknown_and_makes_no_surface():
     depth = np.full((40, 60), 2.0)
     depth[10:20, 15:30] = [0, np.nan, -1] * 5
-    found = depth_in_camera(depth, K, TargetCamera(K, np.eye(4), (60, 40)))
+    found = depth_in_camera(depth, K, PosedCamera(K, np.eye(4), (60, 40)))
     np.testing.assert_allclose(found, np.where(depth > 0, depth, 0), atol=1e-6)
-    backwards = TargetCamera(K, pose(0, 180, 0), (60, 40))
+    backwards = PosedCamera(K, pose(0, 180, 0), (60, 40))
     assert (depth_in_camera(depth, K, backwards) == 0).all()
 
 
 def test_an_output_gives_its_depth_into_another_camera():
     depth = cast(K, np.eye(4), SIZE)[0].astype(np.float32)
     K_to, E, size = CAMERAS[2]
-    expected = depth_in_camera(depth, K, TargetCamera(K_to, E, size))
+    expected = depth_in_camera(depth, K, PosedCamera(K_to, E, size))
     arrays = MetricDepthOutput(prediction=np.stack([depth, 2 * depth])[..., None], K=np.stack([K, K]))
     found = arrays.into(K_to, E, size)
     assert found.shape == (2, 300, 400, 1)
