@@ -51,6 +51,10 @@ CAPTURE_NOTE = (
 )
 
 
+#: Fewest pixels of a frame that another one has to see for their difference to count.
+FEWEST_SEEN = 100
+
+
 def f_score(points: np.ndarray, truth: np.ndarray, right_m: float = RIGHT_M) -> float:
     """F-score of points ``(N, 3)``: within ``right_m`` of the truth's, and back (Tanks and Temples, S4)."""
     if not len(points) or not len(truth):
@@ -68,8 +72,10 @@ def temporal_error(frames: Sequence[DepthFrame]) -> float:
         for frame, other in (pair, pair[::-1]):
             row, column, z, inside = seen_in(frame, other)
             off = np.abs(z[inside] / other.depth[row, column][inside] - 1)
-            errors.append(off[off < HIDDEN_SHARE].mean() if (off < HIDDEN_SHARE).sum() >= 100 else np.nan)
-    return 100 * float(np.nanmean(errors)) if errors and not np.isnan(errors).all() else float("nan")
+            off = off[off < HIDDEN_SHARE]
+            if len(off) >= FEWEST_SEEN:
+                errors.append(off.mean())
+    return 100 * float(np.mean(errors)) if errors else float("nan")
 
 
 def run_capture_eval(name: str, options: CaptureEvalOptions) -> Page | None:

@@ -445,8 +445,12 @@ def _pose_report(capture: Capture) -> Record:
     rounded = plain({name: round(value, 4) for name, value in numbers.items()})
     each = zip(capture.names, solved.connected, *solved.moved(), strict=True)
     frames = {
-        name: {"connected": bool(c), "moved": round(float(m), 5), "turned_deg": round(float(t), 3)}
-        for name, c, m, t in each
-        if math.isfinite(m)
+        name: {
+            "connected": bool(connected),
+            "moved": round(float(moved), 5),
+            "turned_deg": round(float(turned_deg), 3),
+        }
+        for name, connected, moved, turned_deg in each
+        if math.isfinite(moved)
     }
     return {"status": solved.status, **rounded, "notes": list(solved.notes), "frames": frames}

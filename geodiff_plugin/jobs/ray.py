@@ -223,8 +223,10 @@ class _Guide:
 
 
 def _encode(row: Row) -> Row:
+    """The row of a result; of a pair that failed the columns are empty, and the error says why."""
     kept, columns = attempt(row, result_columns)
-    return kept | dict.fromkeys(COLUMNS) | (columns or {"error": kept["error"]})
+    empty = dict.fromkeys(COLUMNS)
+    return kept | empty | (columns or {"error": kept["error"]})
 
 
 def _typed(table: pa.Table) -> pa.Table:

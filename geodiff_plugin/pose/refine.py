@@ -182,6 +182,19 @@ def _refined(misfit: _Misfit, report: PoseReport) -> CheckedViews:
         return CheckedViews(rights, replace(report, status="kept", warnings=warnings))
     keeps_length = misfit.rig or misfit.measured
     Ts, spread = (Ts, None) if keeps_length else _rescaled(tracks, given, Ts, before)
+    warnings = _refined_misfit(before, after, worst, misfit.rig) + doubts
+    report = replace(report, status="refined", warnings=warnings, scale_spread=spread)
+    return _straightened_views(misfit, report, before, Ts)
+
+
+def _straightened_views(
+    misfit: _Misfit, report: PoseReport, before: np.ndarray, Ts: np.ndarray
+) -> CheckedViews:
+    """The views with refined poses ``Ts``, and images without the residuals that these do not explain.
+
+    ``before (V,)`` are the residuals under the poses as given: a view that fitted keeps its image.
+    """
+    tracks = misfit.tracks
     bends = [
         fit_displacement(tracks.view(v), T, size) if before[v] > misfit.fits_px else None
         for v, (T, size) in enumerate(zip(Ts, misfit.sizes, strict=True))
@@ -191,16 +204,13 @@ def _refined(misfit: _Misfit, report: PoseReport) -> CheckedViews:
     behind = behind_infinity(tracks, Ts)
     report = replace(
         report,
-        status="refined",
-        warnings=_refined_misfit(before, after, worst, misfit.rig) + doubts,
-        scale_spread=spread,
         behind_infinity=behind.share,
         behind_px=behind.px,
         E=_as_E(Ts),
         residual_px=tuple(median_residuals(replace(tracks, right_px=straight), Ts).tolist()),
         straightened_px=tuple(0.0 if bend is None else bend.rms_px for bend in bends),
     )
-    return CheckedViews(_applied(rights, Ts, bends), report)
+    return CheckedViews(_applied(misfit.rights, Ts, bends), report)
 
 
 def refined_scale(refined: np.ndarray, given: np.ndarray, misfit: float) -> tuple[float, float]:

@@ -247,9 +247,8 @@ class GuidedScheduler:
             self._timesteps = (scheduler.timesteps if trailing is None else trailing).cpu()
             self._done = 0
             self._run.begin(self._timesteps)
-            scheduler.timesteps = self._timesteps.to(
-                device, non_blocking=True
-            )  # which the pipeline's loop iterates over
+            # The pipeline's loop iterates over these, on its own device.
+            scheduler.timesteps = self._timesteps.to(device, non_blocking=True)
 
         @functools.wraps(stock_step)
         def step(model_output: Tensor, timestep: Any, sample: Tensor, *args: Any, **kwargs: Any) -> Any:
