@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -140,6 +140,11 @@ class StepReport:
     loss: torch.Tensor | None = None  # (B,) total before the round's updates; None without updates
     terms: dict[str, torch.Tensor] = field(default_factory=dict)  # (B,) unweighted value of each, by name
     visible_fraction: torch.Tensor | None = None  # (B,) pixels that a right view sees; 0 without a view
+
+    def cpu(self) -> StepReport:
+        """The same on the CPU."""
+        here: dict[str, Any] = {k: v.cpu() for k, v in vars(self).items() if isinstance(v, torch.Tensor)}
+        return replace(self, **here, terms={name: value.cpu() for name, value in self.terms.items()})
 
 
 @dataclass(frozen=True)

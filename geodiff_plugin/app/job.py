@@ -19,11 +19,12 @@ from geodiff_plugin.app.keeping import Stopped
 from geodiff_plugin.formats.files import upright_size
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.jobs.pair import run_pair, write_pair
+from geodiff_plugin.jobs.pair import run_pair
 from geodiff_plugin.jobs.prior import load_guided_prior
 from geodiff_plugin.jobs.reading import read_pair
 from geodiff_plugin.jobs.records import JobLog, PairResult
 from geodiff_plugin.jobs.telling import collected_warnings, silent
+from geodiff_plugin.jobs.writing import write_pair
 
 #: What the page allows of an option, where that is less than the command does.
 LIMITS = {"steps": 100, "ensemble": 20, "resolution": 4096}

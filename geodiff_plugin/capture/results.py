@@ -19,6 +19,7 @@ from geodiff_plugin.capture.splats import SplatFrame, write_splats
 from geodiff_plugin.formats.clouds import Cloud, flying_points, write_glb, write_vertices
 from geodiff_plugin.formats.colmap import write_colmap
 from geodiff_plugin.formats.depth import write_depth_mm, write_depth_npy
+from geodiff_plugin.formats.files import save_png
 from geodiff_plugin.formats.out import REPORT, atomic_path, files_of_report, write_text
 from geodiff_plugin.formats.transforms import TransformsFile
 from geodiff_plugin.messages import Message
@@ -87,7 +88,7 @@ def write_agreement(capture: Capture, out: Path, names: Sequence[str]) -> dict[s
 def _write_agreed(folder: Path, frame: DepthFrame, unit: str | None) -> None:
     write_depth_npy(folder / "depth.npy", frame.depth)
     write_depth_mm(folder / "depth_mm.png", frame.depth * (frame.confidence > 0))
-    plotting.depth_figure(frame.depth, unit=unit).save(folder / "depth.png")
+    save_png(plotting.depth_figure(frame.depth, unit=unit), folder / "depth.png")
     for file, values in zip(AGREED[1:], (frame.confidence, frame.confirmed, frame.observers), strict=True):
         assert values is not None  # of agreement
         with atomic_path(folder / f"{file}.npy") as temporary:
@@ -275,7 +276,7 @@ def write_workspace(
     views, maps, colours = [], folder / "stereo", np.zeros(points.shape, np.uint8)
     for frame, (px, rows) in zip(frames, seen, strict=True):
         picture = plotting.as_picture(image(frame.name))
-        picture.save(folder / "images" / f"{frame.name}.png")
+        save_png(picture, folder / "images" / f"{frame.name}.png")
         u, v = np.rint(px).astype(int).T.clip(0, np.array(picture.size)[:, None] - 1)
         colours[rows] = np.asarray(picture)[v, u]
         depth, file = np.where(kept(frame), frame.depth, 0)[..., None], f"{frame.name}.png.geometric.bin"

@@ -21,7 +21,7 @@ from PIL import Image
 from geodiff_plugin import plotting
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.formats.clouds import Cloud, write_vertices
-from geodiff_plugin.formats.files import is_turned
+from geodiff_plugin.formats.files import is_turned, save_png
 from geodiff_plugin.formats.layouts import CaptureFrame
 from geodiff_plugin.formats.out import atomic_path, write_text
 from geodiff_plugin.formats.transforms import NERF_CAMERA, TransformsFile, named_in_transforms
@@ -123,7 +123,7 @@ def _write_frame(
     mask_of_depth = np.where(found.sure, np.rint(255 * depth.confidence.clip(1 / 255, 1)), 0).astype(np.uint8)
     mask_path = f"depth_masks/{frame.name}.png"
     with atomic_path(folder / mask_path) as temporary:
-        Image.fromarray(mask_of_depth).save(temporary, format="PNG")
+        save_png(Image.fromarray(mask_of_depth), temporary)
     return entries | {
         "original_path": named,
         "file_path": _write_image(folder, capture, frame),
@@ -150,7 +150,7 @@ def _write_image(folder: Path, capture: Capture, frame: CaptureFrame) -> str:
         return path
     path = f"images/{frame.name}.png"
     with atomic_path(folder / path) as temporary:
-        plotting.as_picture(capture.image(frame.name)).save(temporary, format="PNG")
+        save_png(plotting.as_picture(capture.image(frame.name)), temporary)
     return path
 
 
@@ -161,7 +161,7 @@ def _write_units(folder: Path, name: str, units: np.ndarray) -> str:
     path = f"depths/{name}{'.png' if whole else '.npy'}"
     with atomic_path(folder / path) as temporary:
         if whole:
-            Image.fromarray(np.rint(units).astype(np.uint16)).save(temporary, format="PNG")
+            save_png(Image.fromarray(np.rint(units).astype(np.uint16)), temporary)
         else:
             with open(temporary, "wb") as file:
                 np.save(file, units.astype(np.float32), allow_pickle=False)

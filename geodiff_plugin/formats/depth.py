@@ -10,7 +10,7 @@ from PIL import Image
 
 from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin._strips import row_strips
-from geodiff_plugin.formats.files import PathLike, check_file, open_image, read_npy
+from geodiff_plugin.formats.files import PathLike, check_file, open_image, read_npy, save_png
 from geodiff_plugin.formats.maps import read_map_file, read_pfm
 from geodiff_plugin.formats.out import atomic_path
 
@@ -66,7 +66,7 @@ def write_depth_mm(path: PathLike, depth_m: np.ndarray) -> int:
     """Write ``depth_mm`` as a 16-bit PNG; returns how many of its pixels are 0."""
     whole = depth_mm(depth_m)
     with atomic_path(path) as temporary:
-        Image.fromarray(whole).save(temporary, format="PNG")
+        save_png(Image.fromarray(whole), temporary)
     return int((whole == 0).sum())
 
 

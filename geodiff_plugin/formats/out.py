@@ -11,6 +11,7 @@ import shutil
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, NoReturn, Self, TypeVar
 
@@ -189,6 +190,45 @@ def files_of_report(folder: Path) -> set[str]:
         return set()
 
 
+@dataclass(frozen=True)
+class HeldPlace:
+    """Where the files of a held ``OutFolder`` go; another process may write them while this one holds it."""
+
+    path: Path  # as the user named it
+    target: Path  # the same, absolute, links followed
+    staging: Path  # the hidden folder, locked
+
+    def write(self, fill: Callable[[Path], Result]) -> Result:
+        """Let ``fill`` write into an empty folder, whose files are then moved; returns what ``fill`` does."""
+        files = self.staging / FILES
+        try:
+            files.mkdir()
+            result = fill(files)
+            self._move(files)
+        except InputFileError:  # of a file that it names
+            raise
+        except OSError as error:
+            cure = "Free disk space or check its permissions, and run it again."
+            raise InputFileError(f"{self.path} could not be written ({reason_of(error)}). {cure}") from error
+        finally:
+            shutil.rmtree(files, ignore_errors=True)
+        return result
+
+    def _move(self, files: Path) -> None:
+        """Let a new folder appear by one rename; in one that exists replace each file, the report last."""
+        if not self.target.is_dir():
+            os.rename(files, self.target)
+            return
+        written, earlier = {path.name for path in files.iterdir()}, files_of_report(self.target)
+        for name in sorted(written - {REPORT}):
+            os.replace(files / name, self.target / name)
+        for path in (self.target / name for name in earlier - written):
+            if path.is_file():
+                path.unlink()
+        if REPORT in written:  # last: until then the old one lists what is still to go
+            os.replace(files / REPORT, self.target / REPORT)
+
+
 class OutFolder:
     """A folder that this process alone writes to, from before the work until the result is in it.
 
@@ -239,35 +279,14 @@ class OutFolder:
             shutil.rmtree(staging / FILES)
             print(f"geodiff: removed what a killed run had left in {staging}", file=sys.stderr, flush=True)
 
-    def write(self, fill: Callable[[Path], Result]) -> Result:
-        """Let ``fill`` write into an empty folder, whose files are then moved; returns what ``fill`` does."""
-        files = self._staging / FILES
-        try:
-            files.mkdir()
-            result = fill(files)
-            self._move(files)
-        except InputFileError:  # of a file that it names
-            raise
-        except OSError as error:
-            cure = "Free disk space or check its permissions, and run it again."
-            raise InputFileError(f"{self.path} could not be written ({reason_of(error)}). {cure}") from error
-        finally:
-            shutil.rmtree(files, ignore_errors=True)
-        return result
+    @property
+    def place(self) -> HeldPlace:
+        """Where its files go, while it is held."""
+        return HeldPlace(self.path, self._target, self._staging)
 
-    def _move(self, files: Path) -> None:
-        """Let a new folder appear by one rename; in one that exists replace each file, the report last."""
-        if not self._target.is_dir():
-            os.rename(files, self._target)
-            return
-        written, earlier = {path.name for path in files.iterdir()}, files_of_report(self._target)
-        for name in sorted(written - {REPORT}):
-            os.replace(files / name, self._target / name)
-        for path in (self._target / name for name in earlier - written):
-            if path.is_file():
-                path.unlink()
-        if REPORT in written:  # last: until then the old one lists what is still to go
-            os.replace(files / REPORT, self._target / REPORT)
+    def write(self, fill: Callable[[Path], Result]) -> Result:
+        """``HeldPlace.write``."""
+        return self.place.write(fill)
 
 
 def _remove_empty(folder: Path) -> None:

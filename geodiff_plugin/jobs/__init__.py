@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from geodiff_plugin.jobs.options import DepthOptions as DepthOptions
     from geodiff_plugin.jobs.pair import depth_pair as depth_pair
     from geodiff_plugin.jobs.pair import run_pair as run_pair
-    from geodiff_plugin.jobs.pair import write_pair as write_pair
     from geodiff_plugin.jobs.pairs import PairRef as PairRef
     from geodiff_plugin.jobs.pairs import start_many as start_many
     from geodiff_plugin.jobs.prior import load_guided_prior as load_guided_prior
@@ -30,17 +29,19 @@ if TYPE_CHECKING:
     from geodiff_plugin.jobs.records import JobLog as JobLog
     from geodiff_plugin.jobs.records import PairResult as PairResult
     from geodiff_plugin.jobs.records import PairRun as PairRun
+    from geodiff_plugin.jobs.writing import write_pair as write_pair
 
 _NAMES_OF = {
     "capture": "depth_capture",
     "many": "depth_pairs",
     "merge": "merge_shards",
     "options": "CaptureOptions DepthOptions",
-    "pair": "depth_pair run_pair write_pair",
+    "pair": "depth_pair run_pair",
     "pairs": "PairRef start_many",
     "prior": "load_guided_prior",
     "reading": "PairInputs read_pair",
     "records": "JobLog PairResult PairRun",
+    "writing": "write_pair",
 }
 _MODULE_OF = modules_of(__name__, _NAMES_OF)
 __all__ = sorted(_MODULE_OF)

@@ -21,15 +21,15 @@ from geodiff_plugin._checks import InputError, refuse
 from geodiff_plugin._threads import available_cores
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.jobs.failures import Failures, full_disk
-from geodiff_plugin.jobs.finished import Row, finished_row, row_of
+from geodiff_plugin.jobs.finished import Row, finished_row
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Record, Shard
 from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.jobs.pair import write_pair
 from geodiff_plugin.jobs.pairs import PairRef
 from geodiff_plugin.jobs.parquet import Store
 from geodiff_plugin.jobs.ray import Done, Workers, attempt, encoded, guided_refs, on_actors
 from geodiff_plugin.jobs.rows import GuidedPair
 from geodiff_plugin.jobs.telling import say
+from geodiff_plugin.jobs.writing import write_row
 from geodiff_plugin.priors import find_prior
 
 #: Rows of a Parquet file at most: many small files are slow to list and to read.
@@ -196,7 +196,7 @@ def _folder_of(pair: GuidedPair) -> Row:
     if there is not None:
         return there
     with OutFolder(options.out, inputs=options.read_files(), overwrite=options.overwrite) as folder:
-        return row_of(write_pair(folder, pair.run, **pair.entries).report)
+        return write_row(folder, pair.run, pair.entries)
 
 
 @dataclass

@@ -16,15 +16,21 @@ MOST_NAMES = 5
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
-def full_disk(error: BaseException) -> InputError | None:
+class DiskFull(InputError):
+    """The disk of ``--out`` is full."""
+
+
+def full_disk(error: BaseException) -> DiskFull | None:
     """What to say where an error comes from a full disk, which ends a whole run; ``None`` for all others."""
+    if isinstance(error, DiskFull):
+        return error
     cause: BaseException | None = error
     while cause is not None and getattr(cause, "errno", None) not in DISK_FULL:
         cause = cause.__cause__ or cause.__context__
     if not isinstance(cause, OSError):
         return None
     resumes = "Finished pairs stay; the same command goes on with the rest."
-    return InputError(f"The disk of --out is full ({reason_of(cause)}). {resumes}")
+    return DiskFull(f"The disk of --out is full ({reason_of(cause)}). {resumes}")
 
 
 class Failures:

@@ -13,25 +13,27 @@ import torch
 
 from geodiff_plugin._checks import InputError, refuse
 from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin._threads import Beside, WithinCores
+from geodiff_plugin._threads import Beside, WithinCores, leaves_cpu_free
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.formats import recordings
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.formats.reading import has_pose_per_image
 from geodiff_plugin.jobs.failures import full_disk
-from geodiff_plugin.jobs.finished import Row, file_digests, finished_row, row_of
+from geodiff_plugin.jobs.finished import Row, file_digests, finished_row
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard
 from geodiff_plugin.jobs.options import DepthOptions, start_pair
-from geodiff_plugin.jobs.pair import run_pair, write_pair
+from geodiff_plugin.jobs.pair import run_pair
 from geodiff_plugin.jobs.pairs import COLUMNS, SUMMARY, PairRef, options_of
 from geodiff_plugin.jobs.prior import graphs_for_many, prior_of_options
 from geodiff_plugin.jobs.reading import PairInputs, read_pair
 from geodiff_plugin.jobs.records import JobLog, PairRun
 from geodiff_plugin.jobs.runner import Runner
+from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcess
 from geodiff_plugin.jobs.steady import write_steady_frames
 from geodiff_plugin.jobs.tables import write_table
 from geodiff_plugin.jobs.telling import Tell, silent
+from geodiff_plugin.jobs.writing import write_row
 from geodiff_plugin.options import imported
 from geodiff_plugin.runtime.machine import pick_device
 
@@ -40,13 +42,15 @@ JOURNAL = ".pairs.jsonl"
 
 
 class _EndsRun(BaseException):
-    """Ends the whole run: the prior does not load or the disk is full; its cause says which."""
+    """Ends the whole run: no prior, a full disk, or no process that writes; its cause says which."""
 
 
 @contextmanager
-def _ends_run_on_full_disk() -> Iterator[None]:
+def _ends_run_if_all_would_fail() -> Iterator[None]:
     try:
         yield
+    except ProcessEnded as error:
+        raise _EndsRun from error
     except Exception as error:
         if (full := full_disk(error)) is not None:
             raise _EndsRun from full
@@ -94,7 +98,8 @@ class Stages:
     """The stages of a pair, each called in a thread of its own.
 
     A ``pipe`` that is not given is loaded when the first pair has been read; ``among`` stages compute at the
-    same time and share the cores; ``tell`` hears which prior it is, and what was assumed.
+    same time and share the cores; ``tell`` hears which prior it is, and what was assumed. Beside a GPU a
+    process of its own writes: its thread would keep the others, which launch kernels, from Python's lock.
     """
 
     def __init__(
@@ -109,10 +114,13 @@ class Stages:
         self._options, self._device, self._pipe = options, device, pipe
         self._among, self._tell = among, tell
         self._views, self._folders = Views(options), dict[str, ExitStack]()
+        self._writer = SeparateProcess(write_row.__module__) if leaves_cpu_free(device) else None
 
     def close(self) -> None:
-        """Close the videos, when the threads are done."""
+        """Close the videos and end the process that writes, when the threads are done."""
         self._views.close()
+        if self._writer is not None:
+            self._writer.close()
 
     def read(self, item: Item) -> _OnItsWay:
         """Look at the files, take the folder, decode the views."""
@@ -120,7 +128,7 @@ class Stages:
         options = options_of(ref, self._options)
         folder = start_pair(options, photographs=ref.frame is None)
         held = self._folders[item.key] = ExitStack()
-        with _ends_run_on_full_disk():
+        with _ends_run_if_all_would_fail():
             held.enter_context(folder)
         digests = file_digests(options)  # before: what changes later is another version
         entries = {"pair": {"name": ref.name, "frame": ref.frame, "sha256": digests}}
@@ -159,8 +167,10 @@ class Stages:
     def write(self, pair: _OnItsWay) -> Row:
         """The files, the report last, and the row of the table."""
         assert pair.run is not None
-        with _ends_run_on_full_disk():
-            return row_of(write_pair(pair.folder, pair.run, **pair.entries).report)
+        with _ends_run_if_all_would_fail():
+            if self._writer is None:
+                return write_row(pair.folder, pair.run, pair.entries)
+            return self._writer.call(write_row, pair.folder.place, pair.run, pair.entries)
 
     def release(self, item: Item) -> None:
         """Give back the folder of a pair."""
@@ -247,7 +257,7 @@ def _rows_there(items: Sequence[Item], options: DepthOptions, journal: Journal) 
 def _through(stages: Stages, runner: Runner) -> list[Row]:
     """The records of all pairs, once they are through the stages."""
     try:
-        with _ends_run_on_full_disk():
+        with _ends_run_if_all_would_fail():
             steps = (stages.read, stages.evidence, stages.guide, stages.write)
             return runner.run(*steps, release=stages.release)
     except _EndsRun as ended:

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from geodiff_plugin._checks import warn
-from geodiff_plugin.formats.out import REPORT, OutFolder
+from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import DepthOptions, start_pair, with_folder
 from geodiff_plugin.jobs.prior import prior_of_options
 from geodiff_plugin.jobs.reading import PairInputs, read_pair
 from geodiff_plugin.jobs.records import JobLog, PairResult, PairRun
-from geodiff_plugin.jobs.report import build_report, report_text, single_map
 from geodiff_plugin.jobs.telling import Tell, silent
-from geodiff_plugin.jobs.writing import write_exports, write_into, write_maps, write_undistorted
+from geodiff_plugin.jobs.writing import write_pair
 from geodiff_plugin.runtime.machine import pick_device
 
 
@@ -57,6 +54,7 @@ def run_pair(
                 warn(message)
     finally:
         pipe.set_progress_bar_config(disable=True)
+    output.history = [step.cpu() for step in output.history]  # a run may be sent to another process
     prior = {
         "name": options.prior,
         "pipeline": type(pipe).__name__,
@@ -65,36 +63,6 @@ def run_pair(
         "dtype": options.dtype,
     }
     return PairRun(options, inputs, output, prior, log)
-
-
-def write_pair(folder: OutFolder, run: PairRun, **entries: Any) -> PairResult:
-    """Fill an output folder: every map, what ``--export`` asks for, and last the report.
-
-    ``entries`` of the report are those that only the caller knows. The folder appears whole or not at all.
-    """
-    options, inputs, output = run.options, run.inputs, run.output
-    height, width = inputs.left.shape[:2]
-    with fitting_memory("The result", (width, height)):
-        report = build_report(run) | entries
-
-    def fill(place: Path) -> None:
-        with run.log.stage("write"):
-            report["files"] = write_maps(place, output, inputs.left, options.min_confidence)
-            if inputs.undistorted:
-                write_undistorted(place, inputs.left)
-            if options.into is not None:
-                depth_m = single_map(output.prediction * output.valid)
-                K = np.asarray(output.K)[0].astype(np.float64)
-                report["into"] = write_into(place, depth_m, K, options.into)
-            if options.export:
-                write_exports(place, output, inputs, options)
-        report["files"]["names"] = [*sorted(path.name for path in place.iterdir()), REPORT]
-        report["seconds"] = {stage: round(seconds, 3) for stage, seconds in run.log.seconds.items()}
-        (place / REPORT).write_text(report_text(report) + "\n", encoding="utf-8")
-
-    with fitting_memory("The result", (width, height)):
-        folder.write(fill)
-    return PairResult(run, folder.path, report)
 
 
 def depth_pair(

@@ -15,6 +15,7 @@ from PIL import Image
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.depth import depth_mm
+from geodiff_plugin.formats.files import save_png
 from geodiff_plugin.jobs.finished import Row, file_digests, row_of
 from geodiff_plugin.jobs.many import Views
 from geodiff_plugin.jobs.options import DepthOptions, check_files
@@ -148,5 +149,5 @@ def _in_255ths(share: np.ndarray) -> np.ndarray:
 
 def _png(values: np.ndarray) -> bytes:
     file = BytesIO()
-    Image.fromarray(values).save(file, format="PNG")
+    save_png(Image.fromarray(values), file)
     return file.getvalue()

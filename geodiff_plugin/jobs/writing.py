@@ -1,4 +1,4 @@
-"""The files of a result: maps, pictures, clouds and exports."""
+"""The folder of a result: maps, pictures, clouds, exports and the report."""
 
 from __future__ import annotations
 
@@ -11,14 +11,54 @@ from PIL import Image
 from geodiff_plugin import formats, plotting
 from geodiff_plugin._reprojection import PosedCamera, depth_in_camera
 from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.formats.files import save_png
+from geodiff_plugin.formats.out import REPORT, HeldPlace, OutFolder
 from geodiff_plugin.formats.target import read_target_camera
+from geodiff_plugin.jobs.finished import Row, row_of
+from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import DepthOptions, unique_names
 from geodiff_plugin.jobs.reading import PairInputs
-from geodiff_plugin.jobs.report import single_map, used_poses
+from geodiff_plugin.jobs.records import PairResult, PairRun
+from geodiff_plugin.jobs.report import build_report, report_text, single_map, used_poses
 from geodiff_plugin.types import MetricDepthOutput
 
 #: Depth as the camera of ``--into`` sees it: floats, and whole millimetres.
 INTO = ("depth_into.npy", "depth_into_mm.png")
+
+
+def write_pair(folder: OutFolder | HeldPlace, run: PairRun, **entries: Any) -> PairResult:
+    """Fill an output folder: every map, what ``--export`` asks for, and last the report.
+
+    ``entries`` of the report are those that only the caller knows. The folder appears whole or not at all.
+    """
+    options, inputs, output = run.options, run.inputs, run.output
+    height, width = inputs.left.shape[:2]
+    with fitting_memory("The result", (width, height)):
+        report = build_report(run) | entries
+
+    def fill(place: Path) -> None:
+        with run.log.stage("write"):
+            report["files"] = write_maps(place, output, inputs.left, options.min_confidence)
+            if inputs.undistorted:
+                write_undistorted(place, inputs.left)
+            if options.into is not None:
+                depth_m = single_map(output.prediction * output.valid)
+                K = np.asarray(output.K)[0].astype(np.float64)
+                report["into"] = write_into(place, depth_m, K, options.into)
+            if options.export:
+                write_exports(place, output, inputs, options)
+        report["files"]["names"] = [*sorted(path.name for path in place.iterdir()), REPORT]
+        report["seconds"] = {stage: round(seconds, 3) for stage, seconds in run.log.seconds.items()}
+        (place / REPORT).write_text(report_text(report) + "\n", encoding="utf-8")
+
+    with fitting_memory("The result", (width, height)):
+        folder.write(fill)
+    return PairResult(run, folder.path, report)
+
+
+def write_row(folder: OutFolder | HeldPlace, run: PairRun, entries: dict[str, Any]) -> Row:
+    """``write_pair``, and the row of a table that says what it wrote."""
+    return row_of(write_pair(folder, run, **entries).report)
 
 
 def write_maps(
@@ -29,7 +69,7 @@ def write_maps(
     formats.write_depth_npy(folder / "depth.npy", depth_m)
     valid = single_map(output.valid)
     zeros = formats.write_depth_mm(folder / "depth_mm.png", depth_m * valid)
-    plotting.depth_figure(depth_m, unit=output.unit).save(folder / "depth.png")
+    save_png(plotting.depth_figure(depth_m, unit=output.unit), folder / "depth.png")
     maps = {name: np.asarray(extra)[0] for name, extra in output.extras.items()}
     of_call = {name: getattr(output, name) for name in ("photometric_error", "uncertainty", "confidence")}
     maps |= {name: single_map(value) for name, value in of_call.items() if value is not None}
@@ -38,12 +78,13 @@ def write_maps(
     flying, doubtful, error = formats.flying_points(depth_m), np.zeros(depth_m.shape, dtype=bool), None
     if output.visible is not None:
         visible = single_map(output.visible).astype(bool)
-        Image.fromarray(visible.astype(np.uint8) * 255).save(folder / "visible.png")
+        save_png(Image.fromarray(visible.astype(np.uint8) * 255), folder / "visible.png")
         error = np.where(visible, maps["photometric_error"], np.nan)
     if output.confidence is not None:
-        plotting.share_figure(maps["confidence"], "confidence", 1.0).save(folder / "confidence.png")
+        save_png(plotting.share_figure(maps["confidence"], "confidence", 1.0), folder / "confidence.png")
         doubtful = maps["confidence"] < min_confidence
-    plotting.overview(left, depth_m, maps.get("confidence"), error, output.unit).save(folder / "overview.png")
+    overview = plotting.overview(left, depth_m, maps.get("confidence"), error, output.unit)
+    save_png(overview, folder / "overview.png")
     kept = valid & ~(flying | doubtful)
     points = formats.write_ply(folder / "cloud.ply", depth_m, left, K, valid=kept, unit=output.unit)
     return {
@@ -68,7 +109,7 @@ def write_into(folder: Path, depth_m: np.ndarray, K: np.ndarray, path: Path) -> 
 def write_undistorted(folder: Path, image_01: np.ndarray, number: int = 1) -> str:
     """Write a view without its lens distortion, 1 for the left one, to which the depth belongs; its name."""
     name = "undistorted.png" if number == 1 else f"undistorted-{number}.png"
-    plotting.as_picture(image_01).save(folder / name)
+    save_png(plotting.as_picture(image_01), folder / name)
     return name
 
 

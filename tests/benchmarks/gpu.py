@@ -21,7 +21,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -358,11 +358,11 @@ def folder(bench: Bench) -> Iterator[Row]:
         quiet=True,
     )
     enable_geometry_guidance(bench.pipe, graphs=graphs_for_many(options, bench.device))
-    many = ManyPairs(options, bench.pipe)
-    guided = functools.partial(many.seconds, MOST_ON_THE_WAY, True)
-    calls = {"plain, files read and written": plain, "guided, the command": guided}
-    rounds = 3  # graphs are recorded at the second call of a size
-    taken = {name: min(timed(call, bench.device) for _ in range(rounds)) for name, call in calls.items()}
+    with closing(ManyPairs(options, bench.pipe)) as many:
+        guided = functools.partial(many.seconds, MOST_ON_THE_WAY, True)
+        calls = {"plain, files read and written": plain, "guided, the command": guided}
+        rounds = 3  # graphs are recorded at the second call of a size
+        taken = {name: min(timed(call, bench.device) for _ in range(rounds)) for name, call in calls.items()}
     enable_geometry_guidance(bench.pipe, graphs=False)
     first = next(iter(taken.values()))
     for name, seconds in taken.items():

@@ -10,7 +10,7 @@ import argparse
 import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -85,6 +85,12 @@ class ManyPairs:
         self._options, self._refs = options, start_many(options)
         self._device = pick_device(options.device)
         self._pipe = load_guided_prior(options.prior, self._device) if pipe is None else pipe
+        self._stages = dict[int, Stages]()  # kept: beside a GPU each starts a process
+
+    def close(self) -> None:
+        """End what the stages have opened and started."""
+        for stages in self._stages.values():
+            stages.close()
 
     def seconds(self, most: int, shared: bool) -> tuple[float, float]:
         """Seconds of a clock and of all cores for all pairs.
@@ -96,9 +102,12 @@ class ManyPairs:
         Raises:
             Exception: what a stage raised.
         """
-        stages = Stages(self._options, self._device, self._pipe, among=2 if shared else 1)
+        among = 2 if shared else 1
+        if among not in self._stages:
+            self._stages[among] = Stages(self._options, self._device, self._pipe, among=among)
+        stages = self._stages[among]
         steps = [stages.read, stages.evidence, stages.guide, stages.write]
-        with tempfile.TemporaryDirectory() as folder, closing(stages):
+        with tempfile.TemporaryDirectory() as folder:
             items = [Item(ref.name, ref) for ref in self._refs]
             with Journal(Path(folder) / "pairs.jsonl") as journal:
                 runner = Runner(items, journal, progress=False)
@@ -130,9 +139,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     table = new_table(("threads", *WAYS, "ratio"), "seconds of a clock (of all cores) a pair")
     before = torch.get_num_threads()
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         typed = write_pairs(Path(folder), options.pairs, tuple(options.size))
         many = ManyPairs(replace(typed, device=options.device, prior=options.prior))
+        stack.callback(many.close)
         many.seconds(1, False)  # warms up
         for threads in options.threads:
             torch.set_num_threads(threads)

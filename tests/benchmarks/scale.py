@@ -21,9 +21,10 @@ from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.jobs.pair import run_pair, write_pair
+from geodiff_plugin.jobs.pair import run_pair
 from geodiff_plugin.jobs.prior import prior_of_options
 from geodiff_plugin.jobs.rows import GuidedPair, ReadPair, read_columns, result_columns
+from geodiff_plugin.jobs.writing import write_pair
 from geodiff_plugin.runtime.machine import pick_device
 
 __all__ = ["Pair", "main"]

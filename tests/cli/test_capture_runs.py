@@ -186,7 +186,7 @@ TOO_MUCH = [lambda: np.empty(1 << 50), lambda: torch.empty(1 << 50)]
 
 @pytest.mark.parametrize("ask", TOO_MUCH, ids=["numpy", "torch"])
 def test_what_does_not_fit_the_memory_is_one_sentence_with_its_size(ask, command, geodiff, monkeypatch):
-    monkeypatch.setattr("geodiff_plugin.jobs.pair.build_report", lambda _: ask())
+    monkeypatch.setattr("geodiff_plugin.jobs.writing.build_report", lambda _: ask())
     answer = geodiff(*command, "--steps", 1, "--preset", "paper", "--out", "o", "-q")
     assert answer.code == 2 and "Traceback" not in answer.err
     assert "of 64x48 pixels (0.0 megapixels) does not fit the memory. Make the pictures smaller" in answer.err

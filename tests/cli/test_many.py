@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from geodiff_plugin.jobs import many
+from geodiff_plugin.jobs import many, writing
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import find_pairs
 from tests.cli.conftest import QUICK, call, never, report_of, write_pair
@@ -118,6 +118,31 @@ def test_two_folders_give_what_single_runs_give(geodiff, finished):
     assert sorted(os.listdir("out/b")) == sorted(os.listdir("one"))
 
 
+def test_beside_a_gpu_another_process_writes_the_same_files(geodiff, fresh, made, monkeypatch):
+    calls = []
+
+    class Spied(many.SeparateProcess):
+        def call(self, function, *args):
+            calls.append(function.__name__)
+            return super().call(function, *args)
+
+    monkeypatch.setattr(many, "SeparateProcess", Spied)
+    monkeypatch.setattr(many, "leaves_cpu_free", lambda device: True)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    assert geodiff(*COMMAND, "-q").code == 0
+    torch.set_num_threads(threads)
+    assert calls == ["write_row"] * 3
+    for name in "abc":
+        here, there = (contents(Path(root, "out", name)) for root in (fresh, made))
+        here, there = ({path.name: file for path, file in each.items()} for each in (here, there))
+        reports = [json.loads(each.pop("report.json")) for each in (here, there)]
+        assert here == there
+        assert len({tuple(report.pop("seconds")) for report in reports}) == 1  # the same stages
+        assert reports[0] == reports[1]
+    assert [row["result"] for row in rows_of()] == ["done"] * 3
+
+
 def test_finished_pairs_are_skipped_and_overwrite_does_them_anew(geodiff, finished):
     made = [path.stat().st_mtime_ns for path in DEPTHS]
     for path in (finished / "out" / "b").iterdir():
@@ -160,14 +185,14 @@ def test_a_finished_pair_is_judged_with_strict(geodiff, finished):
 
 
 def test_a_broken_pair_and_a_defect_are_reported_and_the_rest_go_on(geodiff, fresh, monkeypatch):
-    write = many.write_pair
+    write = writing.write_pair
 
     def broken(folder, run, **entries):
         if folder.path.name == "a":
             raise KeyError("nobody thought of this")
         return write(folder, run, **entries)
 
-    monkeypatch.setattr(many, "write_pair", broken)
+    monkeypatch.setattr(writing, "write_pair", broken)
     image = fresh / "right" / "b.png"
     image.write_bytes(image.read_bytes()[:1000])
     answer = geodiff(*COMMAND)
@@ -204,19 +229,19 @@ def test_a_list_with_a_calibration_each_and_maps_of_another_model(geodiff, fresh
 
 
 def test_a_full_disk_ends_the_run_and_keeps_what_is_finished(geodiff, fresh, monkeypatch):
-    write = many.write_pair
+    write = writing.write_pair
 
     def full(folder, run, **entries):
         if folder.path.name == "b":
             raise OSError(errno.EDQUOT, "Disk quota exceeded")
         return write(folder, run, **entries)
 
-    monkeypatch.setattr(many, "write_pair", full)
+    monkeypatch.setattr(writing, "write_pair", full)
     answer = geodiff(*COMMAND)
     assert answer.code == 2 and answer.err.count("exceeded") == 1
     assert "is full (Disk quota exceeded). Finished pairs stay; the same command goes on" in answer.err
     assert Path("out/a/report.json").exists() and not Path("out/b").exists()
-    monkeypatch.setattr(many, "write_pair", write)
+    monkeypatch.setattr(writing, "write_pair", write)
     answer = geodiff(*COMMAND)
     assert answer.code == 0 and "0 failed" in answer.out and "0 there" not in answer.out
 

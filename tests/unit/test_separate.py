@@ -1,0 +1,112 @@
+"""A process that does work for this one: answers, errors, warnings, and its end."""
+
+import errno
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+
+import numpy as np
+import psutil
+import pytest
+import torch
+
+from geodiff_plugin._checks import InputFileError, noted, warn
+from geodiff_plugin.jobs.failures import DiskFull, full_disk
+from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcess
+from geodiff_plugin.messages import Message
+
+
+@pytest.fixture(scope="module")
+def process():
+    process = SeparateProcess("math")
+    yield process
+    process.close()
+
+
+def fails_in_its_own_way(full: bool) -> None:
+    class Odd(Exception):
+        def __init__(self, one, two):
+            super().__init__(f"{one}{two}")
+
+    if full:
+        try:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        except OSError as error:
+            raise full_disk(error) from None
+    raise Odd("no", "body")
+
+
+def warns(where: str) -> str:
+    warn(Message("camera.filled-in", f"cy is assumed in {where}."))
+    print("a library prints")
+    return where
+
+
+def test_it_answers_with_arrays_tensors_and_from_another_process(process):
+    values, weights = process.call(np.divmod, np.arange(10**6), 7)
+    assert values[-1] == 999_999 // 7 and weights.dtype == np.int64
+    assert torch.equal(process.call(torch.add, torch.ones(3), 1), torch.full((3,), 2.0))
+    assert process.call(os.getpid) not in (os.getpid(), process.call(os.getppid))
+
+
+def test_an_error_is_raised_with_its_traceback_and_the_next_call_goes_on(process):
+    with pytest.raises(ValueError, match="expected a nonnegative input|math domain") as caught:
+        process.call(math.sqrt, -1)
+    assert "Traceback" in caught.value.__notes__[0] and "serve" not in str(caught.value)
+    with pytest.raises(RuntimeError, match="Odd: nobody") as caught:
+        process.call(fails_in_its_own_way, False)
+    assert "fails_in_its_own_way" in caught.value.__notes__[0]
+    with pytest.raises(FileNotFoundError):
+        process.call(os.stat, "/nowhere/at/all")
+    assert process.call(math.sqrt, 4) == 2
+
+
+def test_a_full_disk_is_still_known_as_one(process):
+    with pytest.raises(DiskFull, match="No space left") as caught:
+        process.call(fails_in_its_own_way, True)
+    assert full_disk(caught.value) is caught.value
+    assert full_disk(InputFileError("cut off")) is None
+
+
+def test_what_is_warned_of_is_warned_of_here(process):
+    with noted() as told, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert process.call(warns, "a") == "a"
+    assert [message.code for message in told] == ["camera.filled-in"]
+    assert [str(each.message) for each in caught] == ["cy is assumed in a."]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
+def test_a_killed_process_is_said_so_and_closing_it_is_no_error():
+    process = SeparateProcess("math")
+    with pytest.raises(ProcessEnded, match=r"has ended \(exit code -9\)"):
+        process.call(os.kill, process.call(os.getpid), signal.SIGKILL)
+    with pytest.raises(ProcessEnded):
+        process.call(math.sqrt, 4)
+    process.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no groups of processes")
+def test_ctrl_c_and_a_stop_of_the_group_do_not_reach_it(process):
+    assert process.call(os.getpgrp) != os.getpgrp()
+    process.call(os.kill, process.call(os.getpid), signal.SIGINT)
+    assert process.call(math.sqrt, 4) == 2
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
+def test_it_ends_when_the_process_that_asks_is_killed():
+    code = (
+        "import os; from geodiff_plugin.jobs.separate import SeparateProcess; "
+        "process = SeparateProcess('math'); print(process.call(os.getpid), flush=True); "
+        "os.kill(os.getpid(), 9)"
+    )
+    killed = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    pid, until = int(killed.stdout), time.monotonic() + 60
+    while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < until
+        time.sleep(0.05)
