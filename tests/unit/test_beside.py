@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import gc
+import threading
+import time
+from contextlib import contextmanager
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from geodiff_plugin import GeometryGuidance
+from geodiff_plugin import GeometryGuidance, _kernels, _threads
+from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin._threads import Beside, tensors_of
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evidence.evidence import Evidence
@@ -54,3 +59,96 @@ def test_the_answer_is_worked_out_at_once_where_the_caller_needs_the_same_cores(
 def test_what_the_function_raises_at_once_reaches_the_caller():
     with pytest.raises(ZeroDivisionError):
         Beside(lambda: 1 / 0, torch.device("cpu"))
+
+
+class Stream:
+    """A stream of a made-up card; all streams note in one list what they are told."""
+
+    def __init__(self, name: str, said: list[tuple[str, str]], device: torch.device) -> None:
+        self.name, self.said, self.device = name, said, device
+
+    def record_event(self) -> SimpleNamespace:
+        self.said.append((self.name, "records an event"))
+        return SimpleNamespace(wait=lambda: self.said.append((now.stream.name, "waits for the event")))
+
+    def wait_stream(self, other: Stream) -> None:
+        self.said.append((self.name, f"waits for {other.name}"))
+
+
+class OnCard(torch.Tensor):
+    """A tensor that says that it is on a card, and notes the stream that it is kept for."""
+
+    is_cuda = True
+
+    def record_stream(self, stream: Stream) -> None:
+        stream.said.append((stream.name, "keeps the tensor"))
+
+
+#: The stream that work of a thread goes to.
+now = threading.local()
+
+
+@pytest.fixture
+def card(monkeypatch) -> SimpleNamespace:
+    """A made-up card: its device, and what its two streams, the caller's and one beside it, are told."""
+    device, said = torch.device("cuda", 0), list[tuple[str, str]]()
+    beside = Stream("beside", said, device)
+
+    @contextmanager
+    def on(stream: Stream):
+        before, now.stream = getattr(now, "stream", None), stream
+        yield
+        now.stream = before
+
+    now.stream = Stream("caller", said, device)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda _: now.stream)
+    monkeypatch.setattr(torch.cuda, "stream", on)
+    monkeypatch.setattr(_threads, "_stream_beside", lambda _: beside)
+    return SimpleNamespace(device=device, said=said)
+
+
+def test_on_a_card_the_callers_stream_waits_for_the_answer_and_keeps_its_tensors_once(card):
+    seen = []
+
+    def work() -> dict[str, list[torch.Tensor]]:
+        seen.append((now.stream.name, torch.is_grad_enabled(), threading.current_thread().name))
+        return {"parts": [torch.zeros(2), torch.zeros(3).as_subclass(OnCard)]}
+
+    answer = Beside(work, card.device, own_stream=True)
+    first = answer.result()
+    assert answer.result() is first
+    ((stream, gradients, thread),) = seen
+    assert (stream, gradients) == ("beside", False) and thread != threading.current_thread().name
+    assert card.said == [
+        ("caller", "records an event"),
+        ("beside", "waits for the event"),
+        ("caller", "waits for beside"),
+        ("caller", "keeps the tensor"),
+    ]
+
+
+def test_without_a_stream_of_its_own_the_work_goes_to_the_callers(card):
+    answer = Beside(lambda: now.stream.name, card.device)
+    assert answer.result() == "caller" and card.said == []
+
+
+def test_the_thread_has_the_context_of_its_caller(card):
+    kept = _kernels._switched_on
+    with without_kernels():
+        answer = Beside(kept.get, card.device)
+    assert answer.result() is False and kept.get() is True
+
+
+def test_closing_waits_for_the_work_and_what_it_raised_is_for_whoever_asks(card):
+    ended = []
+
+    def work() -> None:
+        time.sleep(0.05)
+        ended.append(1)
+        raise ZeroDivisionError
+
+    answer = Beside(work, card.device)
+    answer.close()
+    assert ended == [1]
+    with pytest.raises(ZeroDivisionError):
+        answer.result()

@@ -14,12 +14,14 @@ from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.matching.planes import Parallax
 from geodiff_plugin.pose import refine
+from geodiff_plugin.pose import tracks as tracks_module
 from geodiff_plugin.pose.lens import remaining_distortion
-from geodiff_plugin.pose.mistakes import find_mistake
+from geodiff_plugin.pose.mistakes import _candidates, find_mistake
 from geodiff_plugin.pose.refine import depths_apart, fit_displacement, refine_views, straightened
 from geodiff_plugin.pose.solve import PosePrior, is_rig, settle_poses, solve_poses
 from geodiff_plugin.pose.tracks import (
     Tracks,
+    _dense_matches,
     behind_infinity,
     epipolar,
     median_residuals,
@@ -143,6 +145,21 @@ def test_a_pose_is_undetermined_where_another_one_gives_other_depths(apart: floa
     assert all(f"differ by {100 * np.expm1(apart):.0f} %" in each for each in messages)
 
 
+@pytest.mark.parametrize("metre", [0.001, 100.0])
+def test_a_refined_pose_does_not_depend_on_the_unit_of_length(metre: float) -> None:
+    """Whatever the prior on turns, shifts and lengths says, of poses in metres or in any other unit."""
+    tracks, _, _ = make_tracks([TRUE, pose((-2.0, 5.0, 0.0), (-0.3, 0.1, 0.05))], count=120)
+    given = np.stack([np.linalg.inv(TRUE @ pose((0.4, -0.3, 0.2), (0.02, 0.01, 0)))] * 2)
+    given[1] = np.linalg.inv(pose((-2.2, 5.3, 0.1), (-0.3, 0.1, 0.05)))
+    longer = given.copy()
+    longer[:, :3, 3] *= metre
+    prior = PosePrior(np.array([0.5, 0.5]))
+    in_metres, found = (solve_poses(tracks, each, prior) for each in (given, longer))
+    assert angle_deg(in_metres[0, :3, :3] @ given[0, :3, :3].T) > 0.05
+    np.testing.assert_allclose(found[:, :3, :3], in_metres[:, :3, :3], atol=1e-6)
+    np.testing.assert_allclose(found[:, :3, 3], metre * in_metres[:, :3, 3], rtol=1e-4, atol=1e-6 * metre)
+
+
 def test_the_refinement_is_joint_and_reaches_the_optimum() -> None:
     """Poses of both views and the points that both see, as SciPy's least squares finds them all at once."""
     poses = [TRUE, pose((-2.0, 5.0, 0.0), (-0.3, 0.1, 0.05))]
@@ -201,6 +218,17 @@ def test_a_mistake_is_named(true, given, K_given, words: str) -> None:
     T = np.linalg.inv(given)
     found = find_mistake(replace(tracks, K_left=K_given, K_rights=K_given[None]), T, T)
     assert found is not None and re.search(words, found)
+
+
+def test_k_of_another_size_keeps_the_corner_of_the_first_pixel() -> None:
+    """As the cure says, with the centre of that pixel at 0: each ray goes to ``(u + 0.5) * s - 0.5``."""
+    tracks, Ts, _ = make_tracks([TRUE], count=10)
+    candidates = list(_candidates(tracks, Ts[0]))
+    scaled = [each.K_left for said, each, _ in candidates if said.code == "camera.scaled"]
+    assert len(scaled) >= 6
+    for K_scaled in scaled:
+        factor, rays = K_scaled[0, 0] / K[0, 0], tracks.rays @ K_scaled.T
+        np.testing.assert_allclose(rays[:, :2], (tracks.left_px + 0.5) * factor - 0.5)
 
 
 @pytest.mark.parametrize(
@@ -469,3 +497,19 @@ def test_a_rig_is_not_told_that_another_pose_fits_as_well(monkeypatch) -> None:
         messages = [m for m in report.warnings if m.code == "pose.undetermined"]
         assert bool(messages) == told and all(m.forbids_trust for m in messages), report
         assert (report.depth_spread > 0.0) is told
+
+
+def test_a_dense_match_holds_where_the_flow_from_its_place_leads_back(monkeypatch) -> None:
+    """The flow leads 6 px to the right; back it leads from column 30 on."""
+    there, back = (np.zeros((60, 80, 2), np.float32) for _ in range(2))
+    there[..., 0], back[:, 30:, 0] = 6.0, -6.0
+    flows = iter([there, back])
+    monkeypatch.setattr(tracks_module, "_flow", lambda *_: next(flows))
+    image = np.random.default_rng(0).integers(0, 255, (60, 80), np.uint8)
+    v, u = np.mgrid[:60, :80].astype(np.float32)
+    centres = np.stack(np.meshgrid(np.arange(5, 80, 10), np.arange(5, 60, 10)), -1).reshape(-1, 2)
+    to_right = np.stack([u + 2.5, v], axis=-1)  # where the rough depth puts the pixels in the right view
+    px, holds = _dense_matches(image, image, to_right, np.ones((60, 80), bool), centres)
+    landed = centres[:, 0] + 6
+    np.testing.assert_array_equal(holds, (landed >= 30) & (landed <= 79))
+    np.testing.assert_allclose(px[holds], centres[holds] + [6.0 + 2.5, 0.0])

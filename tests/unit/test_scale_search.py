@@ -1,5 +1,7 @@
 """The search for metres, on made-up pairs with a known answer."""
 
+import math
+
 import pytest
 import torch
 
@@ -81,3 +83,25 @@ def test_noise_of_far_matches_does_not_pull_the_far_end_nearer(seed):
     near, far = refine_to_matches(x, matches, nearest * 1.05, farthest * 0.8, "disparity")
     assert float(near) == pytest.approx(float(nearest), rel=0.02)
     assert float(far) == pytest.approx(float(farthest), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("start", "reached"),
+    [
+        ((1.0 * math.exp(1.35), 10.0), (1.0, 10.0)),
+        ((1.0 * math.exp(1.5), 10.0), (math.exp(0.1), None)),  # near moves by a log factor of 1.4 at most
+        ((0.5 * math.exp(-0.65), 10.0), (1.0, 10.0)),
+        ((1.0, 10.0 * math.exp(0.65)), (1.0, 10.0)),
+        ((1.0, 10.0 * math.exp(0.9)), (None, 10.0 * math.exp(0.2))),  # far by one of .7
+        ((1.0, 10.0 * math.exp(-0.65)), (1.0, 10.0)),
+        ((1.0, 10.0 * math.exp(-0.9)), (None, 10.0 * math.exp(-0.2))),
+    ],
+)
+def test_a_fit_moves_near_and_far_as_far_as_its_basin_reaches(start, reached):
+    """Exact matches of a map from 1 to 10 m."""
+    x = torch.linspace(0.0, 1.0, SIZE[0] * SIZE[1]).view(1, 1, *SIZE)
+    depth = 1.0 + 9.0 * x[0]
+    matches = m.Matches(1.0 / depth, torch.full_like(depth, 0.99), torch.tensor(0.001))
+    found = refine_to_matches(x, matches, *(torch.tensor([end]) for end in start), "depth")
+    for end, expected in zip(found, reached, strict=True):
+        assert expected is None or float(end) == pytest.approx(expected, rel=0.01)

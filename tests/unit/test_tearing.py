@@ -39,6 +39,15 @@ def test_a_moved_part_of_any_picture_is_found_with_its_row_and_shift(view, row, 
     assert twice == Tear(view, 2 * found.row, 2 * found.px)
 
 
+@pytest.mark.parametrize("view", [0, 1])
+def test_row_and_shift_are_in_pixels_of_the_torn_picture_whatever_size_the_other_has(view):
+    """Looked at in 240 and 150 rows, of pictures of 960 and 300."""
+    pictures, heights = [scene(1), scene(2)[:150]], [4 * HEIGHT, 2 * 150]
+    pictures[view] = torn(pictures[view], 80, -12)
+    factor = (4, 2)[view]
+    assert find_tear(pictures, heights) == Tear(view, 80 * factor, -12 * factor)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_a_whole_picture_is_not_torn(seed):
     assert find_tear([scene(seed), scene(100 + seed)], [HEIGHT, HEIGHT]) is None
