@@ -15,6 +15,7 @@ from geodiff_plugin.matching.aggregation import aggregate
 from geodiff_plugin.matching.census import census, census_cost, grey_levels
 from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.sweep import sweep_planes
+from geodiff_plugin.matching.winner import winner
 from geodiff_plugin.scale.volume_search import group_pixels, look_up
 from geodiff_plugin.types import CameraView, PosedViews
 from tests.golden.parts import scene, volume
@@ -58,6 +59,30 @@ def test_census_counts_16_neighbours_in_a_window_of_7():
     described = [census(grey_levels(torch.from_numpy(image).float())) for image in grey]
     np.testing.assert_array_equal(torch.stack(described), votes)
     np.testing.assert_array_equal(census_cost(*described), np.abs(votes[0] - votes[1]).sum(0))
+
+
+def test_a_winner_is_the_plane_of_least_sum_with_its_evidence():
+    """Pixel by pixel, winners on the first and the last plane among them; a parabola needs three sums."""
+    rng, planes = np.random.default_rng(0), 12
+    sums = rng.integers(0, 800, (planes, 6, 9))
+    sums[0, :, 0], sums[-1, :, 1] = 1, 1
+    sums[:, :, 2] = 7  # all alike: the first plane
+    levels, seen = rng.integers(0, 225, sums.shape), rng.random(sums.shape) < 0.7
+    levels[~seen] = 78
+    found = winner(*map(torch.from_numpy, (sums.astype(np.int16), levels.astype(np.uint8), seen)))
+    for y, x in np.ndindex(6, 9):
+        total, level = sums[:, y, x], levels[:, y, x]
+        k = int(total.argmin())
+        offset = 0.0
+        if 0 < k < planes - 1:
+            offset = np.roots(np.polyder(np.polyfit((-1, 0, 1), total[k - 1 : k + 2], 2)))[0]
+        assert found.position[y, x].item() == pytest.approx(k + np.clip(offset, -0.5, 0.5), abs=1e-5)
+        assert found.best[y, x] == total[k]
+        assert found.runner_up[y, x] == total[np.abs(np.arange(planes) - k) > 1].min()
+        gain = max(0.0, level[seen[:, y, x]].mean() - level[k]) / 224
+        assert found.gain[y, x].item() == pytest.approx(gain, abs=1e-6)
+        beside = level[max(k - 4, 0)] / 2 + level[min(k + 4, planes - 1)] / 2
+        assert found.sharpness[y, x].item() == pytest.approx((beside - level[k]) / 224, abs=1e-6)
 
 
 def test_a_plane_costs_what_the_views_that_see_the_pixel_say():

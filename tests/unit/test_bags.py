@@ -1,6 +1,7 @@
 """Bags: pairs by their time stamps, every encoding, cameras of raw and rectified images, depth read back."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.formats import read_calibration
+from geodiff_plugin.formats.bag_images import both_as_01, decode_image
 from geodiff_plugin.formats.recordings import (
     BagFrame,
     BagReader,
@@ -148,6 +150,43 @@ def test_colours_of_every_encoding_of_luminance(tmp_path) -> None:
         path = write_bag(tmp_path / f"{encoding}.mcap", encoding=encoding, images=(image, image))
         with BagReader(path, TOPICS, 0.005) as reader:
             np.testing.assert_allclose(reader.read(0)[5, 5], [1, 0, 0], atol=0.02)
+
+
+def raw(encoding: str, image: np.ndarray, big: bool = False) -> SimpleNamespace:
+    """The message of an image, in either order of bytes, with 6 bytes behind every row."""
+    numbers = image.astype(image.dtype.newbyteorder(">" if big else "<"))
+    rows = np.ascontiguousarray(numbers).view(np.uint8).reshape(len(image), -1)
+    data = np.pad(rows, ((0, 0), (0, 6)), constant_values=255)
+    size = {"height": image.shape[0], "width": image.shape[1], "step": data.shape[1]}
+    return SimpleNamespace(encoding=encoding, is_bigendian=big, data=data.ravel(), **size)
+
+
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("name", ["rgb", "rgba", "bgr", "bgra", "UC3", "UC4", "rggb", "bggr", "gbrg", "grbg"])
+def test_every_encoding_of_colours_gives_them_back_in_their_order(name, bits, big) -> None:
+    """A picture of one colour; a Bayer pattern is named by its pixels row by row."""
+    colour = dict(zip("rgba", (200, 100, 40, 9), strict=True))
+    letters = {"UC3": "bgr", "UC4": "bgra"}.get(name, name)
+    values = np.array([colour[letter] for letter in letters], f"u{bits // 8}") * (1 if bits == 8 else 257)
+    if letters.count("g") == 2:
+        encoding, image = f"bayer_{name}{bits}", np.tile(values.reshape(2, 2), (5, 6))
+    else:
+        encoding, image = f"{bits}{name}" if name[0] == "U" else f"{name}{bits}", np.tile(values, (10, 12, 1))
+    found = decode_image(raw(encoding, image, big), Path("a.mcap"))
+    expected = np.array([200, 100, 40]) * (1 if bits == 8 else 257)
+    np.testing.assert_array_equal(found[2:-2, 2:-2], np.broadcast_to(expected, (6, 8, 3)))
+
+
+@pytest.mark.parametrize(
+    ("most", "full"),
+    [(1023, 1023), (1024, 4095), (4095, 4095), (4096, 16383), (16383, 16383), (16384, 65535)],
+)
+@pytest.mark.filterwarnings("ignore:.*16-bit images reach")
+def test_sixteen_bits_hold_the_fewest_of_a_camera_that_the_brightest_pixel_needs(most, full) -> None:
+    images = [np.full((2, 2, 3), value, np.uint16) for value in (most, 7)]
+    left, right = both_as_01(images, Path("a.mcap"))
+    assert left.max() == pytest.approx(most / full) and right.max() == pytest.approx(7 / full)
 
 
 @pytest.mark.parametrize(
