@@ -23,7 +23,7 @@ from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.captures import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
 from geodiff_plugin.jobs import capture as run
-from geodiff_plugin.jobs.lengths import spans_to_measure
+from geodiff_plugin.jobs.lengths import Span, measure, spans_to_measure
 from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.plotting import grid
@@ -454,6 +454,19 @@ def test_ends_of_a_length_are_pixels_of_the_image_as_taken(tmp_path):
     far = CaptureOptions(path=tmp_path, measure=("f04:0,0,100,100",))
     with pytest.raises(InputError, match="image without lens distortion has"):
         spans_to_measure(Capture.open(tmp_path), far)
+
+
+def test_the_ends_of_a_length_are_read_at_the_nearest_pixels(tmp_path):
+    """Without lens distortion they lie between pixels; depth rises by 0.1 a column."""
+    depth = (2.0 + 0.1 * np.arange(SIZE[0])).repeat(SIZE[1]).reshape(SIZE).T.astype(np.float32)
+    (tmp_path / "f04").mkdir()
+    for name, values in (("depth", depth), ("confidence", np.full_like(depth, 0.9))):
+        np.save(tmp_path / f"f04/{name}.npy", values)
+    capture = SimpleNamespace(names=["f04"], unit="m", solve=lambda: SimpleNamespace(K=K[None]))
+    ends = np.array([[10.6, 20.4], [30.3, 25.7]])
+    (record,) = measure(capture, [Span("f04", ends, ends)], tmp_path, (), 0.0)
+    points = [depth[v, u] * (np.linalg.inv(K) @ (u, v, 1)) for u, v in ((11, 20), (30, 26))]
+    assert record["length"] == pytest.approx(np.linalg.norm(points[1] - points[0]), rel=1e-6)
 
 
 @pytest.mark.parametrize("confidence", [0.95, 0.1])

@@ -11,11 +11,13 @@ from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.algorithm.state import chunk_views
 from geodiff_plugin.algorithm.terms import Given, Objective
 from geodiff_plugin.config import KNOBS, GuidanceConfig
+from geodiff_plugin.evidence import prepare
 from geodiff_plugin.evidence import store as evidence_store
 from geodiff_plugin.evidence.inputs import Inputs
-from geodiff_plugin.evidence.prepare import make_evidence, prepare_evidence
+from geodiff_plugin.evidence.prepare import make_evidence, prepare_evidence, rows_beside
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.geometry import warp_right_to_left
+from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale.space import MetricMap
 from geodiff_plugin.types import CameraView, PosedViews
 from tests.benchmarks.matching import textured_pair
@@ -177,3 +179,17 @@ def test_every_knob_that_evidence_is_made_with_is_told_apart_by_the_store(made):
         assert getattr(config, name) != value
         store.get(left, given, GuidanceConfig().changed(**{name: value}), True)
     assert len(made) == 1 + len(others)
+
+
+@pytest.mark.parametrize(("of_match", "of_point"), [(0.5, 2.0), (2.0, 0.5), (2.0, None)])
+def test_rows_are_sought_up_to_the_nearest_of_matches_and_known_points(monkeypatch, of_match, of_point):
+    monkeypatch.setattr(prepare, "match_rectified", lambda native, nearest: nearest)
+    matches, points = (
+        None
+        if most is None
+        else Matches(torch.tensor([[[[0.1, most]]]]), torch.ones(1, 1, 1, 2), torch.ones(1))
+        for most in (of_match, of_point)
+    )
+    left, given = pair()
+    assert rows_beside(given.beside(left), matches, points).result() == 2.0
+    assert rows_beside(given.beside(left), None, points) is None

@@ -54,6 +54,18 @@ def test_true_relative_map_gives_the_true_metres(scene, space):
     assert float(near) == pytest.approx(float(depth.min()), rel=0.05)
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "on_edge"),
+    [(0.5, 2.0, False), (1.3, 2.0, True), (0.5, 0.7, True), (None, None, False)],
+)
+def test_a_search_that_ends_on_either_edge_of_a_given_range_says_so(scene, low, high, on_edge):
+    """``low`` is in shares of the nearest depth, ``high`` of the farthest."""
+    volume, depth = scene
+    bounds = None if low is None else (low * float(depth.min()), high * float(depth.max()))
+    found = search_scale(volume, relative(depth, "depth"), "depth", depth_range=bounds)
+    assert found.on_edge.tolist() == [on_edge], found
+
+
 @pytest.mark.parametrize("space", SPACES)
 def test_refinement_finds_the_truth_among_outliers(scene, space):
     volume, depth = scene

@@ -119,6 +119,22 @@ def test_depth_that_16_bits_do_not_hold_well_is_of_floats(length, tmp_path):
     check(tmp_path / "out", length)
 
 
+def test_the_mask_of_a_pixel_that_is_used_is_never_0_however_little_is_known_of_it(tmp_path):
+    """Trainers leave out pixels whose mask is 0."""
+    capture = Capture.open(write_transforms(tmp_path / "scan", TRUE, TRUE))
+    load = loader(capture)
+
+    def unsure(name: str) -> SplatFrame:
+        found = load(name)
+        confidence = np.zeros_like(found.depth.confidence)
+        confidence[:, 100:] = 0.001
+        return replace(found, depth=replace(found.depth, confidence=confidence))
+
+    written(capture, tmp_path / "out", unsure)
+    mask = np.asarray(Image.open(tmp_path / "out/depth_masks/f02.png"))
+    np.testing.assert_array_equal(mask, sure_of().astype(np.uint8))
+
+
 def test_images_with_a_lens_are_written_without_it_and_without_their_masks(tmp_path):
     source = write_transforms(tmp_path / "scan", TRUE, TRUE)
     capture = Capture.open(source)
