@@ -5,21 +5,25 @@
 Each mutant is a file of the package, a text that occurs in it once, and another text in its place. It is
 applied in a temporary copy of the checkout, where the fast tests named beside it run until the first fails.
 Printed are the mutants that survive, and those whose text is no longer there. With words, only the mutants of
-files whose path contains one of them run.
+files whose path contains one of them run. Kernels run in Triton's interpreter; without Triton their mutants
+are left out.
 """
 
 import importlib
 import os
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
 import traceback
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("geodiff_plugin", "tests", "examples", "docs", "pyproject.toml", "constraints.txt", "README.md")
+OPTIONS = "-x -q -n 0 -p no:cacheprovider -W ignore::pytest.PytestAssertRewriteWarning".split()
 PARTS, REFERENCES = "tests/golden/test_parts.py", "tests/parity/test_numpy_references.py"
 
 
@@ -31,13 +35,18 @@ class Mutant(NamedTuple):
     instead: str
     tests: tuple[str, ...] = ()
 
+    @property
+    def of_kernel(self) -> bool:
+        """Whether it is a slip in a Triton kernel, or in its launch."""
+        return self.file.endswith("kernels.py") and "/" in self.file
+
 
 def of(file: str, *slips: tuple[str, str], tests: tuple[str, ...] = ()) -> list[Mutant]:
     """Mutants of one file; ``tests`` run before the parts and the references."""
     return [Mutant(file, *slip, tests) for slip in slips]
 
 
-UNIT = "tests/unit/test_"
+UNIT, KERNELS = "tests/unit/test_", "tests/kernels/test_"
 THRESHOLDS = (f"{UNIT}verdict_thresholds.py", f"{UNIT}verdict.py")
 CAPTURES = ("tests/parity/test_capture_references.py",)
 MUTANTS = [
@@ -528,6 +537,174 @@ MUTANTS = [
         ("span.frame not in doubted", "span.frame in doubted"),
         tests=(f"{UNIT}capture.py",),
     ),
+    *of(
+        "pose/tearing.py",
+        ("np.abs(below - beside[::-1])", "np.abs(below - beside)"),
+        ("heights[view] / len(greys[view])", "heights[0] / len(greys[0])"),
+        ("if len(torn) != 1 or any", "if len(torn) == 0 or any"),
+        tests=(f"{UNIT}tearing.py",),
+    ),
+    *of(
+        "matching/uprights.py",
+        ("_certain_median(flat - pitch)", "_certain_median(flat + pitch)"),
+        ("min(certain, key=abs) if certain[0]", "max(certain, key=abs) if certain[0]"),
+        tests=(f"{UNIT}uprights.py",),
+    ),
+    *of(
+        "pose/lens.py",
+        ("min((k1, *others), key=abs) if all", "max((k1, *others), key=abs) if all"),
+        tests=(f"{UNIT}pose_refine.py",),
+    ),
+    *of(
+        "pose/mistakes.py",
+        ("(Ks[:, :2, 2] + 0.5) * factor - 0.5", "Ks[:, :2, 2] * factor"),
+        tests=(f"{UNIT}pose_refine.py",),
+    ),
+    *of(
+        "pose/solve.py",
+        ("1.0 / (prior.shifted_share * baseline)", "1.0 / prior.shifted_share"),
+        tests=(f"{UNIT}pose_refine.py",),
+    ),
+    *of(
+        "pose/tracks.py",
+        ("flow + _read(back, landed)", "flow + _read(back, centres)"),
+        tests=(f"{UNIT}pose_refine.py",),
+    ),
+    *of(
+        "pose/multiview.py",
+        ("(self.connected[of] and self.connected[beside])", "(self.connected[of] or self.connected[beside])"),
+        tests=(f"{UNIT}capture.py",),
+    ),
+    *of("matching/winner.py", ("(index > 0) & (index < last)", "(index > 0) & (index <= last)")),
+    *of(
+        "matching/alignment.py",
+        ("np.tile(scale > 0, 2)", "np.repeat(scale > 0, 2)"),
+        tests=(f"{UNIT}matching.py",),
+    ),
+    *of(
+        "matching/rows.py",
+        ("[image[:, ::-1] for image in images], -infinity", "[image[:, ::-1] for image in images], infinity"),
+        tests=(f"{UNIT}algorithm.py",),
+    ),
+    *of(
+        "matching/consistency.py",
+        ("matches.confidence.clamp_min(1.0)", "matches.confidence.clamp(0.0, 1.0)"),
+        tests=(f"{UNIT}flattening.py",),
+    ),
+    *of(
+        "scale/volume_search.py",
+        ("near_m <= low * 1.02", "near_m >= low * 1.02"),
+        tests=(f"{UNIT}scale_search.py",),
+    ),
+    *of(
+        "scale/points.py",
+        (
+            "near_m / math.exp(NEAR_REACH), far_m / math.exp(FAR_REACH)",
+            "near_m / math.exp(FAR_REACH), far_m / math.exp(NEAR_REACH)",
+        ),
+        tests=(f"{UNIT}scale_search.py",),
+    ),
+    *of(
+        "evidence/prepare.py",
+        ("nearest = torch.maximum(nearest, points", "nearest = torch.minimum(nearest, points"),
+        tests=(f"{UNIT}evidence.py",),
+    ),
+    *of(
+        "evidence/store.py",
+        ('("pose", "crisp", "clean_photographs"', '("pose", "clean_photographs"'),
+        ("needs_matches, measured, given.unit)", "needs_matches, measured)"),
+        tests=(f"{UNIT}evidence.py",),
+    ),
+    *of(
+        "evidence/inputs.py",
+        ("array.shape[1] in (4, 6)", "array.shape[1] in (4,)"),
+        tests=(f"{UNIT}known_points.py",),
+    ),
+    *of(
+        "algorithm/settling.py",
+        ("(index == 0) | (index == len(candidates) - 1)", "(index == 0) | (index == len(candidates))"),
+        tests=(f"{UNIT}algorithm.py",),
+    ),
+    *of(
+        "algorithm/edges.py",
+        (
+            "halo - rows.start + part.start, halo - part.stop + rows.stop",
+            "halo - part.stop + rows.stop, halo - rows.start + part.start",
+        ),
+        tests=(f"{UNIT}algorithm.py",),
+    ),
+    *of(
+        "capture/splats.py",
+        ("depth.confidence.clip(1 / 255, 1)", "depth.confidence.clip(0, 1)"),
+        tests=(f"{UNIT}splats.py",),
+    ),
+    *of("jobs/lengths.py", ("(round(x), round(y))", "(int(x), int(y))"), tests=(f"{UNIT}capture.py",)),
+    *of(
+        "formats/bag_images.py",
+        ('("gbrg", "GR"), ("grbg", "GB")', '("gbrg", "GB"), ("grbg", "GR")'),
+        ("most < 1 << bits", "most <= 1 << bits"),
+        tests=(f"{UNIT}bags.py",),
+    ),
+    *of(
+        "_threads.py",
+        ("                ready.wait()", "                pass"),
+        ("stream.wait_stream(self._stream)", "pass"),
+        ("tensor.record_stream(stream)", "pass"),
+        ("return context.run(function)", "return function()"),
+        ("with torch.no_grad(), torch.cuda", "with torch.cuda"),
+        ("shutdown(wait=True, cancel", "shutdown(wait=False, cancel"),
+        ("self._stream.record_event(), _stream_beside(device)", "None, _stream_beside(device)"),
+        tests=(f"{UNIT}beside.py", "tests/integration/test_threads.py"),
+    ),
+    *of(
+        "_kernels.py",
+        ("_switched_on.set(_switched_on.get() and not off)", "_switched_on.set(not off)"),
+        ("tensor.is_cuda and torch.version.hip is None", "tensor.is_cuda"),
+        ("has_triton() and (on_device or interpreting())", "has_triton() and on_device"),
+        tests=(f"{UNIT}kernel_switch.py",),
+    ),
+    *of(
+        "result/kernels.py",
+        ("1 if prior_error[0].numel() == 1 else 2", "1"),
+        ("K[1, 1], K[0, 1] / K[0, 0]", "K[1, 1], 0.0"),
+        tests=(
+            f"{KERNELS}result.py::test_confidence",
+            f"{KERNELS}result.py::test_a_right_image_seen_from_the_left",
+        ),
+    ),
+    *of(
+        "result/flattening_kernels.py",
+        ("inverse, smoothed, *links, pull", "inverse, smoothed, *links[::-1], pull"),
+        tests=(f"{KERNELS}flattening.py",),
+    ),
+    *of(
+        "scale/kernels.py",
+        ("map_kernel[(triton.cdiv(pixels, PIXELS), batch)]", "map_kernel[(triton.cdiv(pixels, PIXELS), 1)]"),
+        tests=(f"{KERNELS}space.py",),
+    ),
+    *of(
+        "scale/search_kernels.py",
+        ("points.BASIN_KEEP, 0.0)", "1.0, 0.0)"),
+        ("reach / (grid - 1) * (2 if last else 1)", "reach / (grid - 1) * 2"),
+        tests=(f"{KERNELS}search.py",),
+    ),
+    *of(
+        "algorithm/correction_kernels.py",
+        ("max(height, width) / correction.REFERENCE_SIDE", "width / correction.REFERENCE_SIDE"),
+        ("n, target.plane_step.numel(), match_noise", "n, 1, match_noise"),
+        tests=(f"{KERNELS}correction.py",),
+    ),
+    *of(
+        "algorithm/edge_kernels.py",
+        ("(triton.cdiv(height * width, BLOCK), batch)", "(triton.cdiv(height * width, BLOCK), 1)"),
+        tests=(f"{KERNELS}edges.py",),
+    ),
+    *of(
+        "matching/kernels.py",
+        ("FIRST=number == 0", "FIRST=True"),
+        ("            lines[:, first:],", "            lines,"),
+        tests=(f"{KERNELS}matching.py",),
+    ),
 ]
 
 
@@ -570,13 +747,22 @@ def _run(copy: Path, tests: list[str]) -> int:
     sys.path[:] = [str(copy), *(path for path in sys.path if Path(path).resolve() != ROOT)]
     os.environ["PYTHONPATH"] = str(copy)
     os.chdir(copy)
-    options = "-x -q -n 0 -p no:cacheprovider -W ignore::pytest.PytestAssertRewriteWarning".split()
-    return int(pytest.main([*options, *tests]))
+    return int(pytest.main([*OPTIONS, *tests]))
+
+
+def killed_in_interpreter(copy: Path, mutant: Mutant) -> bool:
+    """Whether the tests of a kernel fail in Triton's interpreter, which is chosen where Triton is imported."""
+    command = [sys.executable, "-m", "pytest", *OPTIONS, *mutant.tests]
+    with (copy / "log.txt").open("w") as log:
+        settings = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": str(copy)}
+        ended = subprocess.run(command, cwd=copy, env=settings, stdout=log, stderr=log, check=False)
+    return ended.returncode != 0
 
 
 def main(words: list[str]) -> int:
     """Run the mutants of files that contain a word, all without any; how many are not killed."""
     chosen = [m for m in MUTANTS if not words or any(word in m.file for word in words)]
+    chosen = [m for m in chosen if not m.of_kernel or find_spec("triton") is not None]
     importlib.import_module("tests.golden.parts")  # and with it all that a run then need not import anew
     survivors, gone = [], []
     with tempfile.TemporaryDirectory() as name:
@@ -591,7 +777,7 @@ def main(words: list[str]) -> int:
                 continue
             start = time.perf_counter()
             path.write_text(source.replace(mutant.text, mutant.instead), encoding="utf-8")
-            dead = killed(copy, mutant)
+            dead = killed_in_interpreter(copy, mutant) if mutant.of_kernel else killed(copy, mutant)
             path.write_text(source, encoding="utf-8")
             word = "killed" if dead else "SURVIVES"
             print(

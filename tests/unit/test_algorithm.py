@@ -11,7 +11,9 @@ from geodiff_plugin.algorithm.correction import correction_target, fit_depth, of
 from geodiff_plugin.algorithm.edges import sharpen_edges
 from geodiff_plugin.algorithm.gradients import RULES, Adam, FiniteWatch, power_above, pull_back
 from geodiff_plugin.algorithm.schedule import count_steps, make_schedule
+from geodiff_plugin.algorithm.settling import search_one_number
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
+from geodiff_plugin.algorithm.terms import Given, Loss
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.prepare import rows_beside
@@ -48,6 +50,39 @@ def test_corrections_are_spread_over_the_second_half_of_what_is_active(steps, co
 def test_more_steps_than_a_prior_has_are_refused():
     with pytest.raises(ValueError, match="num_inference_steps must be at most 1 with this prior; got 4"):
         count_steps(4, 4, 1)
+
+
+class OneNumber:
+    """A loss that is least at one of the candidates for g_s, each of which shows a share of the image."""
+
+    config = DEFAULT.changed(g_s_range=(0.5, 5.0), g_s_candidates=10, min_visible=0.2)
+
+    def __init__(self, best: int, unseen: tuple[int, ...] = ()) -> None:
+        self.candidates = torch.linspace(0.5, 5.0, 10)
+        self.best, self.unseen = self.candidates[best], self.candidates[list(unseen)]
+
+    def __call__(self, x: Tensor, given: Given) -> Loss:
+        g_s = given.affine.g_s
+        share = torch.where(torch.isin(g_s, self.unseen), 0.19, 0.9)
+        return Loss(g_s, {"photometric": (g_s - self.best).abs()}, share)
+
+
+@pytest.mark.parametrize(
+    ("best", "unseen", "found", "on_edge"),
+    [
+        (0, (), 0, True),
+        (1, (), 1, False),
+        (8, (), 8, False),
+        (9, (), 9, True),
+        (4, (4, 5), 3, False),  # what hardly any pixel of the right image shows does not win
+        (8, (7, 8), 9, True),
+    ],
+)
+def test_the_one_number_is_that_of_least_loss_and_either_end_is_an_edge(best, unseen, found, on_edge):
+    objective = OneNumber(best, unseen)
+    affine, edge = search_one_number(torch.zeros(2, 1, 4, 4), objective)
+    assert affine.g_s.tolist() == [pytest.approx(float(objective.candidates[found]))] * 2
+    assert edge.tolist() == [on_edge] * 2 and not affine.s_hat.any() and not affine.t_hat.any()
 
 
 def test_adam_equals_torch_adam():

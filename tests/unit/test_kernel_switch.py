@@ -1,12 +1,13 @@
 """Whoever waits for kernels to be compiled is told so, and nobody else."""
 
 import logging
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from geodiff_plugin import _kernels
-from geodiff_plugin._kernels import ALWAYS_LAUNCHED, compilation_ahead, without_kernels
+from geodiff_plugin._kernels import ALWAYS_LAUNCHED, compilation_ahead, use_kernel, without_kernels
 from geodiff_plugin.jobs import prior as jobs_prior
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.runtime import guided_call
@@ -42,6 +43,33 @@ def test_kernels_that_triton_has_not_compiled_are_told_of(cache, monkeypatch):
     assert compilation_ahead(CUDA) is None
     monkeypatch.setattr(_kernels, "has_triton", lambda: False)
     assert compilation_ahead(CUDA) is None
+
+
+@pytest.mark.parametrize(
+    ("is_cuda", "hip", "triton", "interpreted", "used"),
+    [
+        (True, None, True, False, True),
+        (True, "6.2", True, False, False),  # ROCm
+        (True, None, False, False, False),
+        (False, None, True, False, False),
+        (False, None, True, True, True),
+        (False, None, False, True, False),
+    ],
+)
+def test_kernels_run_on_cuda_or_in_the_interpreter_unless_they_are_switched_off(
+    is_cuda, hip, triton, interpreted, used, monkeypatch
+):
+    monkeypatch.setattr(torch.version, "hip", hip)
+    monkeypatch.setattr(_kernels, "has_triton", lambda: triton)
+    monkeypatch.setattr(_kernels, "interpreting", lambda: interpreted)
+    tensor = SimpleNamespace(is_cuda=is_cuda)
+    assert use_kernel(tensor) is used
+    with without_kernels():
+        assert use_kernel(tensor) is False
+        with without_kernels(False):  # as of a call with kernels within one without
+            assert use_kernel(tensor) is False
+        assert use_kernel(tensor) is False
+    assert use_kernel(tensor) is used
 
 
 def test_that_kernel_is_one(cache):

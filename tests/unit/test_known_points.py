@@ -47,6 +47,12 @@ def test_text_as_people_have_it(tmp_path, kind):
     np.testing.assert_allclose(read_points(tmp_path / "points.csv"), POINTS)
 
 
+@pytest.mark.parametrize("columns", [3, 4, 6])
+def test_points_may_have_an_intensity_or_a_colour_behind_them(columns):
+    rows = np.column_stack([POINTS, np.full((2, 3), 200.0, np.float32)])[:, :columns]
+    np.testing.assert_array_equal(as_points(rows, "points").numpy(), POINTS)
+
+
 PLY = "ply\nformat {kind} 1.0\ncomment by hand\nelement vertex 2\n{properties}{more}end_header\n"
 PROPERTIES = "property double x\nproperty uchar red\nproperty float y\nproperty float z\n"
 
