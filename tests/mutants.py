@@ -751,7 +751,7 @@ def _run(copy: Path, tests: list[str]) -> int:
 
 
 def killed_in_interpreter(copy: Path, mutant: Mutant) -> bool:
-    """Whether the tests of a kernel fail in Triton's interpreter, which is chosen where Triton is imported."""
+    """Whether the tests of a kernel fail in Triton's interpreter, chosen where Triton is imported."""
     command = [sys.executable, "-m", "pytest", *OPTIONS, *mutant.tests]
     with (copy / "log.txt").open("w") as log:
         settings = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": str(copy)}

@@ -12,6 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import Capture
+from geodiff_plugin.capture.agreement import seen_in
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.formats.depth import disparity_of_depth
 from geodiff_plugin.formats.transforms import nerf_pose
@@ -23,7 +24,7 @@ from geodiff_plugin.result.indicators import measure_indicators
 from geodiff_plugin.result.misfit import expected_error
 from geodiff_plugin.result.output import _in_the_priors_metres
 from geodiff_plugin.result.voting import _enlarged
-from geodiff_plugin.types import CameraView, MetricDepthOutput, PosedViews
+from geodiff_plugin.types import CameraView, DepthFrame, MetricDepthOutput, PosedViews
 
 K = np.array([[400.0, 0.0, 159.5], [0.0, 410.0, 119.5], [0.0, 0.0, 1.0]])
 
@@ -91,6 +92,46 @@ def test_everything_of_a_capture_is_rescaled_together(tmp_path):
     np.testing.assert_allclose(capture.poses[:, :3, 3], 0.3048 * E[:, :3, 3])
     np.testing.assert_allclose(capture.frames[1].points, 0.3048 * known)
     assert capture.unit == "m"
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("shift", "lost"), [(-0.4, None), (-0.6, 0), (0.4, None), (0.6, -1)])
+def test_a_point_is_in_a_picture_up_to_the_outer_edges_of_its_pixels(axis, shift, lost):
+    """Another camera at the same place, whose principal point lies part of a pixel further on."""
+    depth, E = np.full((5, 7), 2.0), poses(3)[1]
+    small = np.array([[10.0, 0.0, 3.0], [0.0, 10.0, 2.0], [0.0, 0.0, 1.0]])
+    moved = small.copy()
+    moved[axis, 2] += shift
+    frame, other = (DepthFrame("", depth, np.ones_like(depth), each, E) for each in (small, moved))
+    expected = np.ones(depth.shape, bool)
+    if lost is not None:
+        expected[(slice(None), lost) if axis == 0 else lost] = False
+    seen = seen_in(frame, other)
+    np.testing.assert_array_equal(seen.inside, expected)
+    for at, found, along in zip(np.indices(depth.shape), (seen.row, seen.column), (1, 0), strict=True):
+        nearest = np.rint(at + (shift if axis == along else 0.0))
+        np.testing.assert_array_equal(found[expected], nearest[expected])
+    np.testing.assert_allclose(seen.z, 2.0)
+
+
+def test_points_that_three_frames_see_are_known_depths_of_each_in_its_camera(tmp_path):
+    """Of four points one is seen by two frames, one by all four, and one lies behind the first camera."""
+    E = poses(4)
+    points = np.array([[0.0, 0.1, 3.0], [0.5, -0.2, 4.0], [0.1, 0.3, 5.0], [0.0, 0.0, -6.0]])
+    by_frame = ([0, 1, 2, 3], [0, 1, 2, 3], [1, 2, 3], [2])
+    for i in range(4):
+        Image.new("RGB", (320, 240)).save(tmp_path / f"{i}.png")
+    frames = [{"file_path": f"{i}.png", "transform_matrix": np.eye(4).tolist()} for i in range(4)]
+    camera = {"fl_x": 400.0, "fl_y": 410.0, "cx": 160.0, "cy": 120.0, "w": 320, "h": 240}
+    (tmp_path / "transforms.json").write_text(json.dumps(camera | {"frames": frames}))
+    capture = Capture.open(tmp_path)
+    seen = tuple((np.zeros((len(which), 2)), np.array(which)) for which in by_frame)
+    connected = np.array([True, True, True, False])
+    capture.solved = SolvedCapture("solved", E, E, np.tile(K, (4, 1, 1)), connected, points, seen)
+    for name, pose, which in (("0", E[0], [1, 2]), ("1", E[1], [1, 2]), ("2", E[2], [1, 2])):
+        expected = (points[which] - pose[:3, 3]) @ pose[:3, :3]
+        np.testing.assert_allclose(capture.known_depths(name, "tracks"), expected, rtol=1e-5)
+    assert capture.known_depths("3", "tracks") is None  # the solve does not hold it
 
 
 def test_a_shrunk_picture_keeps_every_ray_and_right_views_are_as_fine_as_the_left():

@@ -1,18 +1,20 @@
 """Parts of the guided call: schedule, gradient rules, least-squares fields, correction, last stage."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.algorithm import edges
+from geodiff_plugin.algorithm import correction, edges
 from geodiff_plugin.algorithm.correction import correction_target, fit_depth, off_edges
 from geodiff_plugin.algorithm.edges import sharpen_edges
 from geodiff_plugin.algorithm.gradients import RULES, Adam, FiniteWatch, power_above, pull_back
 from geodiff_plugin.algorithm.schedule import count_steps, make_schedule
 from geodiff_plugin.algorithm.settling import search_one_number
-from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
+from geodiff_plugin.algorithm.solver import FieldSystem, RobustField, solve_field
 from geodiff_plugin.algorithm.terms import Given, Loss
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.evidence.evidence import Evidence
@@ -201,6 +203,20 @@ def test_a_correction_spreads_over_its_surface_and_stops_at_an_edge():
     assert (own / 2.0 - 1.0).abs().max() < 0.09
     assert (other / 2.4 - 1.0).abs().max() < 0.09  # half of what the surface beside it moved by
     assert support[..., 10:14].min() > 0.3 and support[..., 31:].max() < 0.1
+
+
+def test_a_correction_on_a_finer_grid_reaches_a_coarser_map_as_its_mean(monkeypatch):
+    """Every third column of the matches' grid is corrected; the map has a third of its columns and rows."""
+    columns = torch.zeros(1, 1, 36, 45)
+    columns[..., 1::3] = 0.3
+    monkeypatch.setattr(correction, "solve_robust", lambda *_, **__: RobustField(columns, columns, columns))
+    depth, left = torch.full((1, 1, 12, 15), 2.0), torch.rand(1, 3, 36, 45)
+    matches = matches_at(torch.full((1, 1, 36, 45), 2.0), torch.ones(1, 1, 36, 45))
+    refined, support, change = fit_depth(depth, matches, left, STRONG)
+    inner = (..., slice(1, -1), slice(1, -1))
+    torch.testing.assert_close(refined[inner], torch.full_like(refined[inner], 2.0 * math.exp(-0.1)))
+    torch.testing.assert_close(support[inner], torch.full_like(support[inner], 0.1))
+    assert change is columns
 
 
 def test_beside_an_edge_of_a_good_map_a_match_counts_for_less_and_a_point_does_not():
