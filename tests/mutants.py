@@ -612,7 +612,7 @@ MUTANTS = [
     *of(
         "evidence/store.py",
         ('("pose", "crisp", "clean_photographs"', '("pose", "clean_photographs"'),
-        ("needs_matches, measured, given.unit)", "needs_matches, measured)"),
+        ("needs_matches, measured_baseline, given.unit)", "needs_matches, measured_baseline)"),
         tests=(f"{UNIT}evidence.py",),
     ),
     *of(

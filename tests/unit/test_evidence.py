@@ -162,7 +162,9 @@ def test_every_knob_that_evidence_is_made_with_is_told_apart_by_the_store(made):
     (given,) = GeometryGuidance(right, K, torch.linalg.inv(T)).inputs
     config = Watched()
     Watched.read.clear()
-    make_evidence(left, given, config, True)
+    assert config.needs_matches(False)
+    of_needs = set(Watched.read)
+    make_evidence(left, given, config)
     others = {
         "pose": "given",
         "crisp": False,
@@ -172,12 +174,12 @@ def test_every_knob_that_evidence_is_made_with_is_told_apart_by_the_store(made):
         "sweep_pixels": 99_999,
         "search": "one-number",
     }
-    assert Watched.read == others.keys(), "a knob that changes evidence must be part of the key"
+    assert Watched.read == others.keys() | of_needs, "a knob that changes evidence must be part of the key"
     store = EvidenceStore(size=20)
-    store.get(left, given, GuidanceConfig(), True)
+    store.get(left, given, GuidanceConfig())
     for name, value in others.items():
         assert getattr(config, name) != value
-        store.get(left, given, GuidanceConfig().changed(**{name: value}), True)
+        store.get(left, given, GuidanceConfig().changed(**{name: value}))
     assert len(made) == 1 + len(others)
 
 

@@ -101,9 +101,8 @@ def test_costs_against_the_definition(turn, at, count):
 def test_what_a_right_camera_sees_of_planes_that_reach_behind_it(turn, at):
     """By projection: with a camera half a metre ahead, planes nearer than that are not seen."""
     left, (image, K_right, T), K, _, _ = scene(turn, at)
-    volume = m.sweep_planes(
-        left.mean(0)[None], [(image.mean(0)[None], K_right, T)], K, torch.linspace(0.0, 3.0, 31)
-    )
+    grey = PosedViews(left.mean(0)[None], (CameraView(image.mean(0)[None], K_right, T),), K)
+    volume = m.sweep_planes(grey, torch.linspace(0.0, 3.0, 31))
     rows, columns = torch.meshgrid(*(torch.arange(n).double() for n in SIZE), indexing="ij")
     rays = torch.stack([columns, rows, torch.ones_like(rows)], -1) @ torch.linalg.inv(K.double()).T
     at_infinity, camera = rays @ (K_right @ T[:3, :3]).double().T, (K_right @ T[:3, 3]).double()
