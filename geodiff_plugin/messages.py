@@ -196,6 +196,13 @@ MESSAGES: dict[str, MessageKind] = {
         cause="Models of structure from motion have no known scale.",
         cure="Give the measured distance between the cameras (baseline_m, --baseline).",
     ),
+    "calibration.assumed-metres": MessageKind(
+        "The calibration's unit is assumed to be metres",
+        cause="The file does not say its unit, and its cameras would stand further apart than 1.5 m.",
+        cure="Give the measured distance between the cameras (baseline_m, --baseline), or name the unit in "
+        "the file, as in translation_mm.",
+        forbids_trust=True,
+    ),
     "calibration.doffs": MessageKind(
         "The right cx of a Middlebury file contradicts doffs",
         cause="cam1 is missing, or differs from cx0 + doffs, which the ground truth was made with.",

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin._checks import UnknownFormatError, bad_type, bad_value, check_number, warn
-from geodiff_plugin.formats import colmap, devices, robotics, stereo, storage, transforms
+from geodiff_plugin.formats import colmap, devices, matlab, named, robotics, stereo, storage, transforms
 from geodiff_plugin.formats.files import PathLike
 from geodiff_plugin.formats.foreign import refuse_foreign_calibration
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
@@ -20,6 +20,11 @@ from geodiff_plugin.types import Rig
 
 _JSON = r"\A\s*[{\[]"
 _NUMBER = r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?"
+#: A line that begins with a name of a camera, its matrix or its place.
+_NAME_OF_CAMERA = (
+    r"^[ \t]*(?:[\w.-]*(?i:cam|intrin|extrin|matrix|mtx|dist|stereo|rotation|translation|baseline|left|right)"
+    r"[\w.-]*|[KMDRTP][\w.]?\w?)[ \t]*(?::|=(?!=))"
+)
 #: Every format by name. The first that recognises a file reads it: formats that others contain come first.
 CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "middlebury": CalibrationFormat(
@@ -64,7 +69,7 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         stereo.read_cityscapes),
     "matlab": CalibrationFormat(
         "MATLAB's stereoParams by jsonencode (CameraParameters1)",
-        _JSON + r'(?=[\s\S]*"CameraParameters1")', storage.read_matlab),
+        _JSON + r'(?=[\s\S]*"CameraParameters1")', matlab.read_matlab),
     "vins": CalibrationFormat(
         "VINS-Fusion's configuration (cam0_calib, body_T_cam0)", r"^(cam0_calib|model_type)\s*:",
         robotics.read_vins, beside=robotics.vins_cameras),
@@ -77,7 +82,7 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         r"\A(?![\s\S]*^LEFT\.P[ \t]*:)[\s\S]*^(?:Camera1?\.fx|Camera\.bf)[ \t]*:", robotics.read_orb_slam),
     "opencv": CalibrationFormat(
         "OpenCV YAML, XML or JSON (P1, P2, or M1, M2, R, T)",
-        r'!!opencv-matrix|<opencv_storage|"opencv-matrix"', storage.read_opencv, (1, 2)),
+        r'!!opencv-matrix|<opencv_storage|"opencv-matrix"', named.read_opencv, (1, 2)),
     "ros": CalibrationFormat(
         "pair of ROS camera_info (projection_matrix)",
         r"^(projection_matrix|distortion_model|rectification_matrix)\s*:", robotics.read_ros, (2,)),
@@ -87,10 +92,10 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "colmap": CalibrationFormat(
         "COLMAP model (cameras.txt and images.txt)", colmap.MARK, colmap.read_colmap, (2,), by_image=True,
         as_stored=True),
-    # Whatever JSON is left: which names it lacks is the best that can be said of it.
+    # Whatever JSON is left, and texts with a name of cameras: which names it lacks is the best to be said.
     "named": CalibrationFormat(
-        "JSON, YAML or .npz of named matrices (K1, D1, K2, D2, R, T)",
-        r"\A\s*\{|^(?i:K|M|mtx|camera_?matrix|intrinsics?)(?i:_?(?:1|l|left))?[ \t]*:", storage.read_opencv),
+        "JSON, YAML, TOML or .npz of named matrices (K1, D1, K2, D2, R, T)",
+        rf"\A\s*\{{|{_NAME_OF_CAMERA}", named.read_opencv, (1, 2)),
 }  # fmt: skip
 
 
@@ -196,9 +201,9 @@ def read_calibration(
     entry, source = _format_of(texts), " and ".join(map(str, texts))
     if cameras is not None and not entry.uses_cameras:
         bad_value("cameras", "left out for a file of two cameras", cameras, "It chooses among more than two.")
-    choice = CameraChoice(cameras, image_folder_hint, image_names, image_size)
-    complete = all(text.rstrip()[-1:] in ("}", "]", ">") for text in texts.values())
-    with reading_whole(source, entry.summary, complete):
+    choice = CameraChoice(cameras, image_folder_hint, image_names, image_size, baseline_m)
+    other = "Is it of another program, or of one camera?"
+    with reading_whole(source, entry.summary, *texts.values(), cure=other):
         rig = replace(entry.read(_with_beside(entry, texts), choice), source=source)
     for side, lens in zip(("left", "right"), rig.distortion, strict=True):
         if lens is not None and not distorted:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -9,8 +10,10 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import PurePath
 from typing import Any, TypeVar
+from xml.etree import ElementTree
 
 import numpy as np
+import yaml
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._camera_checks import check_intrinsics, check_pose
@@ -55,6 +58,7 @@ class CameraChoice:
     image_folder_hint: str | None = None
     image_names: tuple[str, str] | None = None
     image_size: Size | None = None
+    baseline_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -92,11 +96,28 @@ class CalibrationFormat:
     beside: Callable[[str], list[str]] | None = None
 
 
+def is_cut_off(text: str) -> bool:
+    """Whether a text ends in the middle: a bracket or the last line is not closed."""
+    opened = sum(text.count(bracket) for bracket in "[{")
+    closed = sum(text.count(bracket) for bracket in "]}")
+    unfinished = "\n" in text and not text.endswith(("\n", "}", "]", ">"))
+    return opened > closed or unfinished
+
+
+def _ended_early(error: Exception) -> bool:
+    """Whether a text ended before what was read of it did."""
+    if isinstance(error, json.JSONDecodeError):
+        return error.pos >= len(error.doc.rstrip())
+    return isinstance(error, (yaml.MarkedYAMLError, EOFError, ElementTree.ParseError))  # others are named
+
+
 @contextmanager
-def reading_whole(source: object, summary: str, complete: bool = False) -> Iterator[None]:
+def reading_whole(
+    source: object, summary: str, *texts: str, cure: str = "Is it of another program?"
+) -> Iterator[None]:
     """Whatever is wrong in the files that are read inside becomes a sentence with their names.
 
-    Of files that are ``complete``, as JSON with its last brace, no one asks whether they were cut off.
+    Only where one of their ``texts`` ends in the middle the sentence asks whether it was cut off.
     """
     try:
         yield
@@ -107,8 +128,8 @@ def reading_whole(source: object, summary: str, complete: bool = False) -> Itera
     except Exception as error:  # of any kind that a damaged file leads to
         got = str(error) if isinstance(error, ValueError) else "other entries"
         got = f"no {error}" if isinstance(error, KeyError) else got
-        cure = "Is it of another program, or of one camera?" if complete else "Is the file cut off?"
-        bad_value(str(source), f"a whole {summary}", got, cure)
+        cut = _ended_early(error) or any(map(is_cut_off, texts))
+        bad_value(str(source), f"a whole {summary}", got, "Is the file cut off?" if cut else cure)
 
 
 def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
@@ -122,7 +143,7 @@ def array_of(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     if not np.isfinite(numbers).all():
         bad_value(name, expected, repr(value), CHECK_FILE)
     if count >= 0 and numbers.size != count:
-        bad_value(name, expected, f"{numbers.size}", "Is the file cut off?")
+        bad_value(name, expected, f"{numbers.size}", CHECK_FILE)
     return numbers.reshape(shape)
 
 

@@ -149,7 +149,7 @@ def read_replica(folder: Path) -> Layout | None:
     params = next((at for at in (folder, folder.parent) if (at / REPLICA_CAMERA).is_file()), None)
     camera, per_m = None, None
     if params is not None:
-        with reading_whole(params / REPLICA_CAMERA, "cam_params.json of Replica", complete=True):
+        with reading_whole(params / REPLICA_CAMERA, "cam_params.json of Replica"):
             entries = json.loads(read_text(params / REPLICA_CAMERA, REPLICA_CAMERA))["camera"]
             K = intrinsics(*(entries[key] for key in ("fx", "fy", "cx", "cy")))
             camera, per_m = Camera(K, (entries["w"], entries["h"])), float(entries["scale"])

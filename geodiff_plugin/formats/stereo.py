@@ -48,6 +48,8 @@ SCENEFLOW_CENTRE = (479.5, 269.5)
 SCENEFLOW_SIZE = (960, 540)
 #: Metres between the cameras of Spring, which its files do not say.
 SPRING_BASELINE_M = 0.065
+#: What the names of its left images, or of their folder, contain.
+SPRING_NAME = "frame_left"
 
 
 def read_middlebury(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
@@ -98,14 +100,26 @@ def read_cityscapes(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 
 
 def read_spring(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """Spring's ``cam_data/intrinsics.txt``: a line fx fy cx cy a frame, the first one of number 1."""
+    """Spring's ``cam_data/intrinsics.txt``: a line fx fy cx cy a frame, the first one of number 1.
+
+    Other programs write such lines too (ETH3D's SLAM sets, ``calib/*.txt`` of DROID-SLAM); only Spring's
+    images, by their names, stand 65 mm apart.
+    """
     rows = array_of(texts[0].split(), (-1,), "fx fy cx cy").reshape(-1, 4)
-    numbers = re.findall(r"\d+", str(choice.image_names[0])) if choice.image_names else []
+    left_image = str(choice.image_names[0]) if choice.image_names else ""
+    if SPRING_NAME not in left_image and choice.baseline_m is None:
+        numbers = " ".join(
+            f"--{name} {x:g}" for name, x in zip(("fx", "fy", "cx", "cy"), rows[0], strict=True)
+        )
+        cure = f"Give the measured distance of parallel cameras: {numbers} --baseline METRES."
+        got = f"fx fy cx cy of one camera and {left_image or 'no image'}"
+        bad_value("the file", "of Spring, whose images are frame_left_0001.png and so on", got, cure)
+    numbers = re.findall(r"\d+", left_image)
     row = int(numbers[-1]) - 1 if numbers else 0
     if (rows != rows[0]).any() and not 0 <= row < len(rows):
         cure = "Spring's images are frame_left_0001.png and so on."
         bad_value("the left image", f"named by its number, 1 to {len(rows)}", choice.image_names, cure)
-    camera = Camera(intrinsics(*rows[row if row < len(rows) else 0]))
+    camera = Camera(intrinsics(*rows[row if 0 <= row < len(rows) else 0]))
     return make_rig(camera, camera, SPRING_BASELINE_M, rectified=True)
 
 

@@ -1,4 +1,4 @@
-"""YAML, and matrices by name: OpenCV's FileStorage, plain JSON, ``.npz`` and MATLAB's ``stereoParams``.
+"""Entries by name of YAML, JSON, TOML, OpenCV's FileStorage and archives of numpy arrays.
 
 OpenCV's own reader is not used: a damaged file can corrupt its memory, and calibrations come from strangers.
 """
@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 import zipfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -18,22 +20,18 @@ import yaml
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.files import parse_xml
-from geodiff_plugin.formats.rigs import (
-    Camera,
-    CameraChoice,
-    array_of,
-    make_rig,
-    projected,
-    rigid,
-    transform,
-)
-from geodiff_plugin.types import Rig
 
 Entries = dict[str, Any]
 #: OpenCV's head of a YAML file, which YAML itself does not know; files written by hand copy it.
 OPENCV_HEAD = re.compile(r"\A\s*%YAML:[^\n]*")
-#: A list behind its name without a blank, which OpenCV reads, as in the settings of ORB-SLAM.
-TIGHT_LIST = re.compile(r"(?m)^(\s*[\w.]+:)\[")
+#: A name and its value without a blank between them, which OpenCV reads, as in the settings of ORB-SLAM.
+TIGHT_ENTRY = re.compile(r"(?m)^(\s*[A-Za-z_][\w.]*:)(?=[^\s:])")
+#: A table, or a name and a list or a number, as TOML has them.
+TOML_LINE = re.compile(
+    r"(?m)^[ \t]*(?:\[+[\w.\"' -]+\]+|[\w.\"'-]+[ \t]*=[ \t]*[-+\d\[\"'tf].*)[ \t]*(?:#.*)?$"
+)
+#: Characters of a line that a message repeats.
+MOST_OF_LINE = 60
 #: Entries may lie so many levels below each other.
 MOST_LEVELS = 8
 #: Dumps of programs that share a list have a few.
@@ -77,17 +75,36 @@ for _kind in ("opencv-matrix", "opencv-nd-matrix"):
 
 def read_yaml(text: str) -> Entries:
     """The mapping that the first YAML document holds; later documents (``rostopic echo``) are left out."""
-    text = TIGHT_LIST.sub(r"\1 [", OPENCV_HEAD.sub("", text))
-    content = next(yaml.load_all(text, _Loader), None)  # noqa: S506  (a safe one)
+    # Tabs separate words in files that OpenCV reads, and YAML has none.
+    text = TIGHT_ENTRY.sub(r"\1 ", OPENCV_HEAD.sub("", text).replace("\t", " "))
+    try:
+        content = next(yaml.load_all(text, _Loader), None)  # noqa: S506  (a safe one)
+    except yaml.MarkedYAMLError as error:
+        end, mark = error.problem_mark, error.context_mark or error.problem_mark
+        if mark is None or end is None or end.index >= len(text.rstrip()):  # it ends too early
+            raise
+        cure = "Correct the line; of another format give fx, fy, cx, cy and baseline, or K and E."
+        line = text.splitlines()[mark.line].strip()[:MOST_OF_LINE]
+        bad_value("the file", "YAML", f"{line!r} in line {mark.line + 1} ({error.problem})", cure)
     if not isinstance(content, dict):
         bad_value("the file", "a YAML file of named entries", type(content).__name__)
     return content
 
 
+def read_content(text: str) -> Entries:
+    """The mapping that a text in XML, TOML, YAML or JSON holds."""
+    if "<opencv_storage" in text:
+        return _of_element(parse_xml(text))
+    if text.lstrip()[:1] != "{" and TOML_LINE.search(text):
+        with suppress(tomllib.TOMLDecodeError):
+            return tomllib.loads(text)
+    # JSON is YAML; older versions of OpenCV write 1. and .Nan into it, which JSON itself does not know.
+    return read_yaml(text)
+
+
 def read_storage(text: str) -> Entries:
     """The entries of an OpenCV file by key in small letters: numbers as flat arrays, and strings."""
-    # JSON is YAML; older versions of OpenCV write 1. and .Nan into it, which JSON itself does not know.
-    content = _of_element(parse_xml(text)) if "<opencv_storage" in text else read_yaml(text)
+    content = read_content(text)
     entries: Entries = {}
     unclear = set[str]()  # names that entries of several parts have, and none of them is the file's own
     for key, value, level in _flat(content, ""):
@@ -104,9 +121,15 @@ def _is_matrix(value: Any) -> bool:
     return isinstance(value, dict) and "data" in value
 
 
+#: What an outer name says of the camera: its side, or its number.
+SIDE = re.compile(
+    r"left|right|(?<=cam)[012](?!\d)|(?<=cam_)[012](?!\d)|(?<=camera)[012](?!\d)|(?<=camera_)[012](?!\d)"
+)
+
+
 def _flat(content: Entries, outer: str, level: int = 0) -> Iterator[tuple[str, Any, int]]:
     """Names, entries and levels, lower ones first, with the side of a camera where an outer name says one."""
-    sides = set(re.findall("left|right", outer.lower()))
+    sides = set(SIDE.findall(outer.lower()))
     side = f"{sides.pop()}." if len(sides) == 1 else ""
     for key, value in content.items():
         if isinstance(value, dict) and not _is_matrix(value) and level < MOST_LEVELS:
@@ -134,104 +157,6 @@ def _numbers(value: Any) -> np.ndarray | None:
         return None
 
 
-def _of(words: str, number: str, side: str) -> str:
-    """Names of a matrix of one camera: its number, letter or side behind a word, or the side before it."""
-    return f"(?:{words})(?:{number}|{side[0]}|{side})|{side}(?:{words})"
-
-
-WORDS = {
-    "M": "m|k|mtx|cameramatrix|intrinsics?|intrinsicmatrix",
-    "D": "d|dis|dist|distcoeffs?|distcoefs?|distort|distortion|distortioncoefficients|distortioncoeffs",
-    "P": "p|projection|projectionmatrix|projmat|projmatrix",
-}
-#: Name in OpenCV's samples -> names in use for the same thing, in small letters without "_" and ".": the
-#: arguments of stereoCalibrate, what tutorials call them, ORB-SLAM's ``LEFT.P``.
-NAMES = {
-    **{f"{name}1": _of(words, "1", "left") for name, words in WORDS.items()},
-    **{f"{name}2": _of(words, "2", "right") for name, words in WORDS.items()},
-    "R": "r|rot|rotation|rotationmatrix",
-    "T": "t|trans|translation|translationmatrix|translationvector",
-    "E": "e|pose",
-    "image_size": "imagesize|imgres|imgsize|size",
-    "image_width": "imagewidth|leftwidth",
-    "image_height": "imageheight|leftheight",
-    "M": WORDS["M"],
-    "D": WORDS["D"],
-    "baseline": "baseline|baselinem|baselinemeters|baselinemetres",
-}
-#: Those that are one number; what else is a number, such as a coefficient ``k1``, is none of the matrices.
-NUMBERS = ("image_width", "image_height", "baseline")
-SIDES = ("image_width", "image_height")
-#: Those that two parallel cameras may share.
-FOR_BOTH = ("M", "D")
-Arrays = list[tuple[str, np.ndarray]]
-
-
-def _named(arrays: Arrays) -> Entries:
-    """What ``NAMES`` has of the arrays, by its names; those that differ under one name are refused."""
-    named: Entries = {}
-    for name, words in NAMES.items():
-        fits = [(key, v) for key, v in arrays if (v.size == 1) == (name in NUMBERS)]
-        fits = [(key, v) for key, v in fits if re.fullmatch(words, re.sub("[_.]", "", key))]
-        differ = any(not np.array_equal(v, fits[0][1]) for _, v in fits[1:])
-        if differ and name in FOR_BOTH:
-            continue
-        if differ:
-            cure = "Keep those that belong to R and T; files of single cameras have no baseline."
-            bad_value(name, "there once", f"{', '.join(key for key, _ in fits)}, which differ", cure)
-        if fits:
-            named[name] = fits[0][1]
-    return named
-
-
-def _lenses(arrays: Arrays, named: Entries) -> list[Any]:
-    """``D1`` and ``D2``, or none; without one that has another name, images would pass for a pinhole's."""
-    given = [named[name] for name in ("D1", "D2") if name in named]
-    others = [key for key, v in arrays if "dist" in key and v.size > 1 and not any(v is d for d in given)]
-    if len(given) < 2 and (others or np.any(given)):
-        cure = "Rename what is lens distortion to D1 and D2, and what is not; a lens without any has zeros."
-        bad_value("the lens distortion", "of both cameras (D1, D2)", ", ".join(others) or "one of them", cure)
-    return given if len(given) == 2 else [(), ()]
-
-
-def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """``P1, P2`` of rectified images, else ``M1, M2, R, T`` and ``D1, D2``; lengths are taken as metres."""
-    arrays = [
-        item for text in texts for item in read_storage(text).items() if isinstance(item[1], np.ndarray)
-    ]
-    named = _named(arrays)
-    sides = np.array([named[name].item() for name in SIDES if name in named])
-    size = next((pair for pair in (named.get("image_size", sides), sides) if pair.size == 2), None)
-    if named.keys() >= {"P1", "P2"}:
-        return projected(named["P1"], named["P2"], size, size)
-    posed = "E" in named and named["E"].size == 16 and "R" not in named  # of 9 it is the essential matrix
-    if "baseline" in named and not posed and not named.keys() & {"R", "T"}:
-        return _parallel(named, arrays, size)
-    missing = [name for name in ("M1", "M2", *(() if posed else ("R", "T"))) if name not in named]
-    if missing:
-        expected = "a calibration with P1, P2, or with M1, M2, R, T"
-        cure = "Where intrinsics and extrinsics are two files, give both; rename what has other names."
-        one = "It is of one camera: give the stereo calibration, or K and E of the pair (--K, --E)."
-        cure = one if "M" in named and not named.keys() & {"M1", "M2"} else cure
-        bad_value("the file", expected, f"no {', '.join(missing)}", cure)
-    lenses = zip(("M1", "M2"), _lenses(arrays, named), strict=True)
-    left, right = (Camera(named[name], size, lens) for name, lens in lenses)
-    if posed:
-        return make_rig(left, right, rigid(named["E"], "E"))
-    return make_rig(left, right, np.linalg.inv(transform(named["R"], named["T"], "R, T")))
-
-
-def _parallel(named: Entries, arrays: Arrays, size: Any) -> Rig:
-    """Parallel cameras of one height, by their matrices, or one for both, and the baseline in metres."""
-    Ks = [named.get(name, named.get("M")) for name in ("M1", "M2")]
-    if any(K is None for K in Ks):
-        bad_value("the file", "a calibration with K1 and K2, or K, and a baseline", "no K1, K2")
-    of_each = "M" not in named or named.keys() & {"D1", "D2"}
-    lenses = _lenses(arrays, named) if of_each else [named.get("D", ())] * 2
-    left, right = (Camera(K, size, lens) for K, lens in zip(Ks, lenses, strict=True))
-    return make_rig(left, right, named["baseline"].item())
-
-
 def text_of_npz(path: Path) -> str:
     """The small arrays of an ``.npz`` as JSON, for ``read_opencv``; nothing is unpickled."""
     matrices: Entries = {}
@@ -245,36 +170,3 @@ def text_of_npz(path: Path) -> str:
     except Exception as error:  # of any kind that a damaged archive leads to
         bad_value("calibration", "a whole .npz of matrices", f"{path} ({error})", "Is it cut off?")
     return json.dumps(matrices)
-
-
-#: What MATLAB calls its units, and how many of them a metre has; millimetres are its default.
-MATLAB_UNITS = {"mm": 1e3, "millimeters": 1e3, "cm": 1e2, "centimeters": 1e2, "m": 1.0, "meters": 1.0}
-
-
-def _matlab_camera(entries: Entries) -> Camera:
-    """A camera of ``cameraParameters``: pixels count from 1, and ``IntrinsicMatrix`` is transposed."""
-    K = array_of(entries.get("K") or entries["IntrinsicMatrix"], (3, 3), "IntrinsicMatrix")
-    K = K.T if K[2, :2].any() else K
-    K[:2, 2] -= 1
-    radial = [*np.ravel(entries["RadialDistortion"]), 0.0][:3]
-    p1, p2 = np.ravel(entries.get("TangentialDistortion") or (0.0, 0.0))
-    size = entries.get("ImageSize") or (None, None)  # rows, columns
-    return Camera(K, (size[1], size[0]), (radial[0], radial[1], p1, p2, radial[2]))
-
-
-def read_matlab(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """MATLAB's ``stereoParameters`` by ``jsonencode``, its rotation transposed as it multiplies rows.
-
-    Source: its documentation; ``RotationOfCamera2`` is ``PoseCamera2.R`` transposed, which newer files have.
-    """
-    data = json.loads(texts[0])
-    left, right = (_matlab_camera(data[f"CameraParameters{n}"]) for n in (1, 2))
-    if "PoseCamera2" in data:
-        R, t = np.array(data["PoseCamera2"]["R"], float), data["PoseCamera2"]["Translation"]
-    else:
-        R, t = np.array(data["RotationOfCamera2"], float).T, data["TranslationOfCamera2"]
-    unit = str(data["CameraParameters1"].get("WorldUnits") or "mm").lower()
-    if unit not in MATLAB_UNITS:
-        bad_value("WorldUnits", f"one of {', '.join(MATLAB_UNITS)}", unit)
-    shift_m = array_of(t, (3,), "TranslationOfCamera2") / MATLAB_UNITS[unit]
-    return make_rig(left, right, np.linalg.inv(transform(R, shift_m, "RotationOfCamera2")))

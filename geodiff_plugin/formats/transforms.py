@@ -79,6 +79,10 @@ class TransformsFile:
 def nerf_frames(text: str) -> Iterator[Frame]:
     """Every frame, with the entries of the whole file that it does not have itself."""
     data = json.loads(text)
+    if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
+        got = f"with {', '.join(map(str, data)) or 'nothing'}" if isinstance(data, dict) else "another value"
+        cure = "Names are in small letters: frames, file_path, transform_matrix."
+        bad_value("transforms.json", "an object with a list 'frames'", got, cure)
     shared = {key: value for key, value in data.items() if key not in ("frames", "transform_matrix")}
     for number, frame in enumerate(data["frames"]):
         yield shared | {"file_path": f"frame {number}"} | frame

@@ -182,7 +182,9 @@ def lose(folder: Path, data: dict) -> None:
     [
         (lose, "at least two frames"),
         (lambda _, data: [data.pop(key) for key in ("fl_x", "fl_y")], "fl_x"),
-        (lambda _, data: data.pop("frames"), "no 'frames'"),
+        (lambda _, data: data.pop("frames"), "an object with a list 'frames'; got with fl_x"),
+        (lambda _, data: data.update(Frames=data.pop("frames")), "Names are in small letters"),
+        (lambda _, data: data.update(frames={}), "an object with a list 'frames'"),
     ],
 )
 def test_bad_captures_get_a_sentence(change, words, tmp_path):
