@@ -255,10 +255,11 @@ def _with_unit(rig: Rig, entries: Entries, choice: CameraChoice) -> Rig:
 
 def _parallel(named: Entries, arrays: Arrays, size: Any) -> Rig:
     """Parallel cameras of one height, by their matrices, or one for both, and the baseline in metres."""
-    Ks = [named.get(name, named.get("M")) for name in ("M1", "M2")]
-    if any(K is None for K in Ks):
+    found = [named.get(name, named.get("M")) for name in ("M1", "M2")]
+    Ks = [_matrix(K, "K") for K in found if K is not None]
+    if len(Ks) != 2:
         bad_value("the file", "a calibration with K1 and K2, or K, and a baseline", "no K1, K2")
     of_each = "M" not in named or named.keys() & {"D1", "D2"}
     lenses = _lenses(arrays, named) if of_each else [named.get("D", ())] * 2
-    left, right = (Camera(_matrix(K, "K"), size, lens) for K, lens in zip(Ks, lenses, strict=True))
+    left, right = (Camera(K, size, lens) for K, lens in zip(Ks, lenses, strict=True))
     return make_rig(left, right, named["baseline"].item())

@@ -108,10 +108,9 @@ def read_spring(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     rows = array_of(texts[0].split(), (-1,), "fx fy cx cy").reshape(-1, 4)
     left_image = str(choice.image_names[0]) if choice.image_names else ""
     if SPRING_NAME not in left_image and choice.baseline_m is None:
-        numbers = " ".join(
-            f"--{name} {x:g}" for name, x in zip(("fx", "fy", "cx", "cy"), rows[0], strict=True)
-        )
-        cure = f"Give the measured distance of parallel cameras: {numbers} --baseline METRES."
+        named = zip(("fx", "fy", "cx", "cy"), rows[0], strict=True)
+        typed = " ".join(f"--{name} {number:g}" for name, number in named)
+        cure = f"Give the measured distance of parallel cameras: {typed} --baseline METRES."
         got = f"fx fy cx cy of one camera and {left_image or 'no image'}"
         bad_value("the file", "of Spring, whose images are frame_left_0001.png and so on", got, cure)
     numbers = re.findall(r"\d+", left_image)
