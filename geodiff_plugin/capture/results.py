@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image, ImageOps
@@ -95,17 +95,24 @@ def _write_agreed(folder: Path, frame: DepthFrame, unit: str | None) -> None:
             np.save(temporary, values)
 
 
-def write_steady(
-    known: Sequence[tuple[Path, np.ndarray, str | None]], picture: Callable[[int], np.ndarray]
-) -> list[int]:
-    """Write what finished frames of a video agree on with their neighbours; the scene of each.
+class FinishedFrame(NamedTuple):
+    """A frame of a video whose own run is finished."""
 
-    Of each its folder, ``K (3, 3)`` and unit; ``picture(i)`` is ``(H, W, 3)`` in [0, 1]. Depth by its own run
-    stays as ``ALONE``, so the same call again changes nothing.
+    folder: Path
+    K: np.ndarray  # (3, 3) pixels of its maps
+    unit: str | None  # of its depth
+
+
+def write_steady(frames: Sequence[FinishedFrame], picture: Callable[[int], np.ndarray]) -> list[int]:
+    """Write what the finished frames of a video agree on with their neighbours; the scene of each.
+
+    ``picture(i)`` is ``(H, W, 3)`` in [0, 1]. Depth by a frame's own run stays as ``ALONE``, so the same call
+    again changes nothing.
     """
-    scenes = scene_poses((_alone(*known[i]), picture(i)) for i in range(len(known)))
-    for (folder, _, unit), frame in zip(known, steadied(scenes, lambda i: _alone(*known[i])), strict=True):
-        _write_agreed(folder, frame, unit)
+    scenes = scene_poses((_alone(frame), picture(i)) for i, frame in enumerate(frames))
+    averaged = steadied(scenes, lambda i: _alone(frames[i]))
+    for frame, depth in zip(frames, averaged, strict=True):
+        _write_agreed(frame.folder, depth, frame.unit)
     return [number for number, poses in enumerate(scenes) for _ in poses]
 
 
@@ -126,13 +133,14 @@ def clear_frame(folder: Path) -> None:
         folder.rmdir()
 
 
-def _alone(folder: Path, K: np.ndarray, _: str | None) -> DepthFrame:
+def _alone(frame: FinishedFrame) -> DepthFrame:
     """Depth and confidence by the frame's own run, saved as ``ALONE`` on first use."""
+    folder = frame.folder
     if not (folder / f"{ALONE[1]}.npy").is_file():
         path = folder / "confidence.npy"
         save_alone(folder, np.load(folder / "depth.npy"), np.load(path) if path.is_file() else None)
     depth, confidence = (np.load(folder / f"{alone}.npy") for alone in ALONE)
-    return DepthFrame(folder.name, depth, confidence, K, np.eye(4))
+    return DepthFrame(folder.name, depth, confidence, frame.K, np.eye(4))
 
 
 def write_results(

@@ -86,10 +86,11 @@ def evaluate_disparity(
     error, truth = np.abs(pred_px - truth_px)[kept], truth_px[kept]
     filled = np.isfinite(error)
     error, truth = error[filled], truth[filled]
-    return {
-        name: None if step_px > limit else float(metric(error, truth)) if error.size else float("nan")
-        for name, (limit, metric) in DISPARITY_METRICS.items()
-    }
+    scores: dict[str, float | None] = {}
+    for name, (limit, metric) in DISPARITY_METRICS.items():
+        score = float(metric(error, truth)) if error.size else float("nan")
+        scores[name] = None if step_px > limit else score
+    return scores
 
 
 def _remaining(error: Map, order: Map, steps: int) -> Map:

@@ -95,7 +95,8 @@ def _read_image(given: Arguments, label: str, cropped: bool, unit: str | None) -
     if given.points is not None:
         points = as_points(given.points, label.format("points"), given.points_confidence)
     right, K = given.right, given.K
-    rights = right if isinstance(right, tuple) else () if right is None else (right,)
+    several = right if isinstance(right, tuple) else (right,)
+    rights = () if right is None else several
     count, name = len(rights), label.format("right")
     names = [name if count == 1 else f"{name}, view {v + 1}," for v in range(count)]
     images = [as_image_01(image, name) for image, name in zip(rights, names, strict=True)]

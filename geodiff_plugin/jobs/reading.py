@@ -121,7 +121,11 @@ def read_pair(
 def _cameras_without_poses(options: DepthOptions, sizes: Sequence[Size]) -> _Cameras:
     way, notes = options.cameras_way(), list[Message]()
     paths = options.photographs().values()
-    Ks = [_intrinsics(options, way, path, i, sizes[i], notes) for i, path in enumerate(paths)]
+    Ks = []
+    for i, path in enumerate(paths):
+        K, said = _intrinsics(options, way, path, i, sizes[i])
+        Ks.append(K)
+        notes += said
     return _Cameras(Ks, notes=tuple(notes))
 
 
@@ -248,23 +252,23 @@ def _read_view_K(path: Path) -> np.ndarray:
 
 
 def _intrinsics(
-    options: DepthOptions, way: str, path: Path, i: int, size: Size, notes: list[Message]
-) -> np.ndarray:
-    """K of photograph ``i`` without a pose, 0 being the left one, from the options, else from its EXIF."""
+    options: DepthOptions, way: str, path: Path, i: int, size: Size
+) -> tuple[np.ndarray, Sequence[Message]]:
+    """K of photograph ``i`` without a pose, 0 being the left one, and what is assumed for it.
+
+    It comes from the options, else from the photograph's EXIF.
+    """
     if i > 1 and options.view_k:
-        return _read_view_K(options.view_k[i - 2])
+        return _read_view_K(options.view_k[i - 2]), ()
     if i > 0 and options.k_right is not None:
-        return _read_K(options.k_right, "--K-right")
+        return _read_K(options.k_right, "--K-right"), ()
     if options.k is not None:
-        return _read_K(options.k, "--K")
+        return _read_K(options.k, "--K"), ()
     if way == "parameters":
-        notes += _filled_in(options)
-        return intrinsics(*_lens_of(options, size))
+        return intrinsics(*_lens_of(options, size)), _filled_in(options)
     if options.fov is not None:
-        return intrinsics_from_fov(options.fov, size)
-    K, of_exif = intrinsics_from_exif(path, path.name)
-    notes += of_exif
-    return K
+        return intrinsics_from_fov(options.fov, size), ()
+    return intrinsics_from_exif(path, path.name)
 
 
 def _known_length(options: DepthOptions, K: np.ndarray, lens: Distortion | None) -> tuple[float, ...] | None:
@@ -338,7 +342,9 @@ def lenses_of(options: DepthOptions, rig: Rig | None = None) -> tuple[Distortion
         rectified = f"--distortion is given, but {rig.source} is for rectified images"
         cure = "Give the rectified images; or the raw ones, with their cameras as --K, --K-right and --E."
         refuse(f"{rectified}. {cure}")
-    pair = (typed[0], typed[-1]) if typed else (None, None) if rig is None else rig.distortion
+    pair = (None, None) if rig is None else rig.distortion
+    if typed:
+        pair = typed[0], typed[-1]
     further = [distortion_from_text(text, "--view-distortion") for text in options.view_distortion]
     if options.view_k and not further and any(is_distorted(lens) for lens in pair):
         cure = "give the lens of each by --view-distortion, 0,0,0,0 for one without distortion"

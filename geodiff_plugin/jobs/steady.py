@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.capture.results import AGREED, ALONE, write_steady
+from geodiff_plugin.capture.results import AGREED, ALONE, FinishedFrame, write_steady
 from geodiff_plugin.formats.out import REPORT, reason_of, write_text
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import PairRef, options_of
@@ -48,13 +48,16 @@ def write_steady_frames(
         return read_pair(options_of(refs[i], options), views(refs[i])).left
 
     try:
-        known = [(f, np.reshape(r["K"], (3, 3)), r["unit"]) for f, r in zip(folders, reports, strict=True)]
+        frames = [
+            FinishedFrame(folder, np.reshape(report["K"], (3, 3)), report["unit"])
+            for folder, report in zip(folders, reports, strict=True)
+        ]
         with warnings.catch_warnings(action="ignore"):  # the run of the pair has warned
-            scenes = write_steady(known, picture)
+            scenes = write_steady(frames, picture)
         for i, scene in enumerate(scenes):
             if options.into is not None:
                 depth = np.load(folders[i] / "depth.npy")
-                reports[i]["into"] = write_into(folders[i], depth, known[i][1], options.into)
+                reports[i]["into"] = write_into(folders[i], depth, frames[i].K, options.into)
             note(i, [f"{name}.npy" for name in AGREED], steady={"scene": scene})
     except OSError as error:
         raise InputError(f"--steady ended ({reason_of(error)}); the same command resumes.") from error

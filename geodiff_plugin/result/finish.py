@@ -109,18 +109,16 @@ def finish(
     depth_m, uncertainty = _one_map(members, depth_m.float().to(native.left_01.device), uncertainty, options)
     left_01 = _resized(native.left_01[None], image_size(depth_m))
     K = resize_intrinsics(native.K_left[None], native.size, image_size(depth_m))
+    uncertainty = None if uncertainty is None else uncertainty.to(depth_m)
     refined = refine(evidence, members, depth_m, left_01, options.config) if options.config.crisp else None
-    if refined is not None:
-        depth_m = refined.depth_m.clamp(max=_farthest_m(evidence, options.config))
-    if uncertainty is not None:
-        uncertainty = uncertainty.to(depth_m)
-        if refined is not None:
-            uncertainty = _spread_of_members(evidence, members, depth_m, left_01, options)
-    visible, error = reprojection(native.views, depth_m, left_01, K) if native.views else (None, None)
     prior_error, confidence = _error_of(members), None
     if refined is not None:
+        depth_m = refined.depth_m.clamp(max=_farthest_m(evidence, options.config))
+        if uncertainty is not None:
+            uncertainty = _spread_of_members(evidence, members, depth_m, left_01, options)
         spread = None if uncertainty is None else uncertainty / depth_m
         confidence = depth_confidence(refined.grounds, spread, prior_error)
+    visible, error = reprojection(native.views, depth_m, left_01, K) if native.views else (None, None)
     relative = median(joined([member.relative for member in members]), 0)[None]
     measured = _Measured(depth_m, relative, confidence, _over_prior(members, depth_m), visible)
     numbers = read_numbers(_numbers(evidence, members, measured, options))

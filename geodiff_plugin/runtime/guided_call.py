@@ -262,8 +262,8 @@ def _check_arguments(call: Mapping[str, Any], images: int) -> None:
     for name in ("batch_size", "ensemble_size"):
         check_number(call[name], name, 1, MOST, integer=True)
     given, members = call["generator"], images * call["ensemble_size"]
-    generators = given if isinstance(given, list) else [] if given is None else [given]
-    if not all(isinstance(generator, torch.Generator) for generator in generators):
+    generators = given if isinstance(given, list) else [given]
+    if given is not None and not all(isinstance(each, torch.Generator) for each in generators):
         bad_type("generator", "None, a torch.Generator or a list of them", given)
     if isinstance(given, list) and len(given) != members:
         expected = f"a torch.Generator, or a list of {members}: one for every image and member"

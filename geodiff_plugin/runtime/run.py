@@ -32,6 +32,10 @@ StepCallback = Callable[[Any, int, Any, dict[str, Tensor | None]], dict[str, Ten
 class GuidedRun:
     """State of one guided call.
 
+    The stock call drives it. For each chunk of samples its loop calls ``begin`` once, and ``guide`` and
+    ``after_step`` at each step (``hooks.GuidedScheduler``). Then it decodes the final latents of one chunk
+    after the other (``metric_prediction``). ``output`` comes last.
+
     Args:
         codec: the pipeline, its prior and the grid that the stock call denoises on.
         guidance: what the user gave.

@@ -338,13 +338,14 @@ def _find_folders(root: Path, name: str) -> list[SampleRef]:
         single = sorted(folder.glob("calib.*"))
         pair = [*sorted(folder.glob("calib_left.*"))[:1], *sorted(folder.glob("calib_right.*"))[:1]]
         calibrated = bool(single) or len(pair) == 2
+        cameras = single[:1] or (pair if calibrated else [folder / "calib.txt"])
         if not (left or right) or bool(left) + bool(right) + calibrated < 2:
             continue
         files = {
             "left": left or folder / "left.png",
             "right": right or folder / "right.png",
-            "calibration": single[0] if single else pair[0] if calibrated else folder / "calib.txt",
-            "calibration_right": pair[1] if calibrated and not single else None,
+            "calibration": cameras[0],
+            "calibration_right": cameras[1] if len(cameras) > 1 else None,
             "depth": next(filter(None, (_existing(folder / depth) for depth in _DEPTHS)), None),
         }
         refs.append(SampleRef(name, folder.resolve().name, files))
