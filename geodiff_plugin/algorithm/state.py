@@ -154,21 +154,25 @@ class Trajectory:
         """At the first estimate: find matches that look like reflections, and measure the prior's error."""
         if self.error is not None or (self.matches is None and self.points is None):
             return
-        config, valid = self.config, self.maps.valid
         depth_m = self.objective.metric_depth(x, self.affine)  # (B, 1, H, W)
         if self.matches is not None and self.reflection_weight is None:
-            self.reflection_weight = torch.ones_like(depth_m)
-            if config.reject_reflections:
-                judged = self.matches if valid is None else self.matches.within(valid)
-                self.reflection_weight = reject_reflections(judged, depth_m)
-                if valid is not None:  # without a prior depth no match is a reflection
-                    inside = F.interpolate(valid.float(), depth_m.shape[-2:], mode="nearest-exact")
-                    self.reflection_weight = torch.where(inside > 0, self.reflection_weight, 1.0)
-        if config.correct or config.crisp:
+            self.reflection_weight = self._weight_by_reflections(self.matches, depth_m)
+        if self.config.correct or self.config.crisp:
             target = self._target(depth_m)
             assert target is not None  # there are matches or points
-            target = target if valid is None else target.within(valid)
-            self.error = prior_error(depth_m, target, self.objective.views.left_01, config)
+            target = target if self.maps.valid is None else target.within(self.maps.valid)
+            self.error = prior_error(depth_m, target, self.objective.views.left_01, self.config)
+
+    def _weight_by_reflections(self, matches: Matches, depth_m: Tensor) -> Tensor:
+        """The factor ``(B, 1, H, W)`` on the confidence of matches that removes reflections."""
+        if not self.config.reject_reflections:
+            return torch.ones_like(depth_m)
+        valid = self.maps.valid
+        if valid is None:
+            return reject_reflections(matches, depth_m)
+        weight = reject_reflections(matches.within(valid), depth_m)
+        inside = F.interpolate(valid.float(), depth_m.shape[-2:], mode="nearest-exact")
+        return torch.where(inside > 0, weight, 1.0)  # without a prior depth no match is a reflection
 
     def _target(self, depth_m: Tensor) -> Matches | None:
         error = local_error(self.error, self.maps.valid)

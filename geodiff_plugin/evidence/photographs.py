@@ -19,9 +19,9 @@ from geodiff_plugin.formats import as_image_01
 from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
 from geodiff_plugin.geometry import image_size, resize_intrinsics, unproject
 from geodiff_plugin.messages import Message
-from geodiff_plugin.pose.estimate import Scale, estimate_poses, find_scale, polished
+from geodiff_plugin.pose.estimate import EstimatedPose, Scale, estimate_poses, find_scale, polished
 from geodiff_plugin.pose.solve import depth_spread, undetermined_pose
-from geodiff_plugin.pose.tracks import coarse_depth, grey_views
+from geodiff_plugin.pose.tracks import Tracks, coarse_depth, grey_views
 from geodiff_plugin.types import CameraView, PosedViews
 
 
@@ -86,6 +86,40 @@ class KnownLengths(NamedTuple):
     points: Any
 
 
+def _in_float32(matrix: np.ndarray) -> Tensor:
+    return torch.as_tensor(matrix, dtype=torch.float32, device="cpu")
+
+
+def _posed(images: Sequence[Tensor], Ks: Sequence[np.ndarray], Ts: Iterable[np.ndarray]) -> PosedViews:
+    """Images, left one first, with the poses ``T_right_from_left`` of the right ones."""
+    rights = (
+        CameraView(image, _in_float32(K), _in_float32(T))
+        for image, K, T in zip(images[1:], Ks[1:], Ts, strict=True)
+    )
+    return PosedViews(images[0], tuple(rights), _in_float32(Ks[0]))
+
+
+class _Solved(NamedTuple):
+    """Poses of photographs whose first baseline has the length 1."""
+
+    Ts: np.ndarray  # (V, 4, 4) T_right_from_left
+    poses: Sequence[EstimatedPose]  # as they were estimated, view by view
+    tracks: Tracks  # that they fit
+    spread: float | None  # ``depth_spread``; ``None`` for a rectified pair
+
+
+def _solved(images: Sequence[Tensor], Ks: Sequence[np.ndarray]) -> _Solved:
+    """Estimate the poses of images, left one first, and fit those of a general pose to all matches."""
+    views = grey_views(_posed(images, Ks, [np.eye(4)] * (len(images) - 1)))
+    tracks, poses = estimate_poses(views)
+    Ts = np.stack([pose.T for pose in poses])
+    if all(pose.rectified for pose in poses):
+        return _Solved(Ts, poses, tracks, None)
+    depth_m = coarse_depth(_posed(images, Ks, Ts), views[0][0].shape)
+    Ts, tracks = polished(views, Ts, depth_m, tracks.seen_anywhere())
+    return _Solved(Ts, poses, tracks, depth_spread(tracks, Ts))
+
+
 def estimate_rig(
     photographs: Sequence[Any],
     known: KnownLengths,
@@ -102,37 +136,24 @@ def estimate_rig(
     Ks, notes = _cameras(photographs, images, K, fov, cropped)
     if known.baseline_m is not None:
         check_number(known.baseline_m, "baseline_m", 1e-6, 1e6)
-    K_left = torch.as_tensor(Ks[0], dtype=torch.float32, device="cpu")
-    size = image_size(images[0])
-    cloud = None if known.points is None else _as_cloud(as_points(known.points, "points"), K_left, size)
-    images = list(cleaned(images, DEFAULT))
-
-    def posed(Ts: Iterable[np.ndarray]) -> PosedViews:
-        rights = (
-            CameraView(image, *(torch.as_tensor(m, dtype=torch.float32, device="cpu") for m in matrices))
-            for image, *matrices in zip(images[1:], Ks[1:], Ts, strict=True)
-        )
-        return PosedViews(images[0], tuple(rights), K_left)
-
-    views = grey_views(posed([np.eye(4)] * (len(images) - 1)))
-    tracks, poses = estimate_poses(views)
-    Ts, spread = np.stack([pose.T for pose in poses]), None
-    if not all(pose.rectified for pose in poses):
-        depth_m = coarse_depth(posed(Ts), views[0][0].shape)
-        Ts, tracks = polished(views, Ts, depth_m, tracks.seen_anywhere())
-        spread = depth_spread(tracks, Ts)
-    factor = tracks.K_left[0, 0] / Ks[0][0, 0]
-    scale = find_scale(tracks, Ts, factor, known.baseline_m, known.known_length, cloud)
+    size, cloud = image_size(images[0]), None
+    if known.points is not None:
+        cloud = _as_cloud(as_points(known.points, "points"), _in_float32(Ks[0]), size)
+    found = _solved(cleaned(images, DEFAULT), Ks)
+    factor = found.tracks.K_left[0, 0] / Ks[0][0, 0]
+    scale = find_scale(found.tracks, found.Ts, factor, known.baseline_m, known.known_length, cloud)
+    Ts, poses = found.Ts.copy(), found.poses
     Ts[:, :3, 3] *= scale.factor
+    of_poses = [warning for pose in poses for warning in pose.warnings]
     return EstimatedRig(
-        size[::-1],
-        tuple(Ks),
-        tuple(np.linalg.inv(T) for T in Ts),
-        tuple(int(pose.inliers.sum()) for pose in poses),
-        tuple(pose.parallax_deg for pose in poses),
-        tuple(pose.residual_px for pose in poses),
-        spread,
-        scale,
-        tuple(notes),
-        (*(s for pose in poses for s in pose.warnings), *undetermined_pose(spread), *scale.warnings),
+        size_left=size[::-1],
+        Ks=tuple(Ks),
+        Es=tuple(np.linalg.inv(T) for T in Ts),
+        inliers=tuple(int(pose.inliers.sum()) for pose in poses),
+        parallax_deg=tuple(pose.parallax_deg for pose in poses),
+        residual_px=tuple(pose.residual_px for pose in poses),
+        depth_spread=found.spread,
+        scale=scale,
+        notes=tuple(notes),
+        warnings=(*of_poses, *undetermined_pose(found.spread), *scale.warnings),
     )

@@ -358,22 +358,33 @@ def write_colmap(
     seen = [(np.zeros((0, 2)), np.zeros(0, int))] * len(views) if seen is None else seen
     cameras = [f"{CAMERAS_MARK} CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     images = [f"{IMAGES_MARK} IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then POINTS2D[]"]
-    points = ["# 3D point list with POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
-    tracks = [""] * len(cloud.points_m)
     for number, ((name, K, E, (width, height)), (px, rows)) in enumerate(zip(views, seen, strict=True), 1):
         numbers = " ".join(f"{v:.9g}" for v in (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
         cameras.append(f"{number} PINHOLE {width} {height} {numbers}")
-        T = np.linalg.inv(E)
-        qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat()
-        numbers = " ".join(f"{v:.12g}" for v in (qw, qx, qy, qz, *T[:3, 3]))
-        images.append(f"{number} {numbers} {number} {name}")
-        each = zip(px + 0.5, rows, strict=True)
-        images.append(" ".join(f"{x:.3f} {y:.3f} {row + 1}" for (x, y), row in each))
-        for index, row in enumerate(rows):
-            tracks[row] += f" {number} {index}"
-    rows_of = zip(cloud.points_m, cloud.colours, tracks, strict=True)
-    for number, ((x, y, z), (r, g, b), track) in enumerate(rows_of, 1):
-        points.append(f"{number} {x:.5f} {y:.5f} {z:.5f} {r} {g} {b} 0{track}")
+        images += _image_lines(number, name, np.linalg.inv(E), px, rows)
+    points = _point_lines(cloud, [rows for _, rows in seen])
     for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
         with atomic_path(Path(folder) / f"{name}.txt") as temporary:
             temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _image_lines(number: int, name: str, T: np.ndarray, px: np.ndarray, rows: np.ndarray) -> list[str]:
+    """The two lines of an image: its world-to-camera pose ``T (4, 4)``, and the points that it sees."""
+    qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat()
+    numbers = " ".join(f"{v:.12g}" for v in (qw, qx, qy, qz, *T[:3, 3]))
+    each = zip(px + 0.5, rows, strict=True)
+    seen = " ".join(f"{x:.3f} {y:.3f} {row + 1}" for (x, y), row in each)
+    return [f"{number} {numbers} {number} {name}", seen]
+
+
+def _point_lines(cloud: Cloud, rows_of_images: Sequence[np.ndarray]) -> list[str]:
+    """The lines of all points, each with the images that see it and its number among the points of these."""
+    tracks = [""] * len(cloud.points_m)
+    for number, rows in enumerate(rows_of_images, 1):
+        for index, row in enumerate(rows):
+            tracks[row] += f" {number} {index}"
+    lines = ["# 3D point list with POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
+    every = zip(cloud.points_m, cloud.colours, tracks, strict=True)
+    for number, ((x, y, z), (r, g, b), track) in enumerate(every, 1):
+        lines.append(f"{number} {x:.5f} {y:.5f} {z:.5f} {r} {g} {b} 0{track}")
+    return lines

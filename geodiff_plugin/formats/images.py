@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -214,6 +216,25 @@ def intrinsics_from_fov(fov_deg: float, size: tuple[int, int]) -> np.ndarray:
     return intrinsics(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
 
 
+def _exif_number(entries: Mapping[int, Any], tag: Base) -> float:
+    """A positive number of the EXIF data; 0 where there is none."""
+    try:
+        value = float(entries.get(tag) or 0.0)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return 0.0
+    return value if math.isfinite(value) and value > 0 else 0.0
+
+
+def _check_uncropped(taken: tuple[float, float], size: tuple[int, int], name: str) -> None:
+    """Refuse an image of another shape than the one it was taken with; both are ``(width, height)``."""
+    width, height = size
+    shapes = [(taken[0] / taken[1]) / shape for shape in (width / height, height / width)]
+    if min(max(ratio, 1 / ratio) for ratio in shapes) > 1 + _SAME_SHAPE:
+        got = f"one of {taken[0]:.0f}x{taken[1]:.0f}: it was cropped since it was taken"
+        cure = f"Give the image as it was taken. {CURES}"
+        bad_value(f"EXIF of {name}", f"of an image of {width}x{height}", got, cure)
+
+
 def intrinsics_from_exif(
     source: PathLike | Image.Image, name: str, *, as_stored: bool = False
 ) -> tuple[np.ndarray, list[Message]]:
@@ -226,23 +247,11 @@ def intrinsics_from_exif(
             K, notes = intrinsics_from_exif(image, name)
             turned = image.getexif().get(ORIENTATION, 1) >= 5 and not as_stored
         return intrinsics(K[1, 1], K[0, 0], K[1, 2], K[0, 2]) if turned else K, notes
-    entries = source.getexif().get_ifd(IFD.Exif)
-
-    def number(tag: Base) -> float:
-        try:
-            value = float(entries.get(tag) or 0.0)
-        except (TypeError, ValueError, ZeroDivisionError):
-            return 0.0
-        return value if math.isfinite(value) and value > 0 else 0.0
-
+    number = partial(_exif_number, source.getexif().get_ifd(IFD.Exif))
     width, height = source.size
     taken = number(Base.ExifImageWidth), number(Base.ExifImageHeight)
     if all(taken):
-        shapes = [(taken[0] / taken[1]) / shape for shape in (width / height, height / width)]
-        if min(max(ratio, 1 / ratio) for ratio in shapes) > 1 + _SAME_SHAPE:
-            got = f"one of {taken[0]:.0f}x{taken[1]:.0f}: it was cropped since it was taken"
-            cure = f"Give the image as it was taken. {CURES}"
-            bad_value(f"EXIF of {name}", f"of an image of {width}x{height}", got, cure)
+        _check_uncropped(taken, source.size, name)
     focal_35, focal_mm = number(Base.FocalLengthIn35mmFilm), number(Base.FocalLength)
     per_unit_x, zoom = number(Base.FocalPlaneXResolution), number(Base.DigitalZoomRatio)
     if focal_35:

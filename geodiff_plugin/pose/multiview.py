@@ -240,23 +240,26 @@ def _scaled(
         depth = _jackknifed(middle, blocks, DEPTH_SPREAD).not_below(SCALE_FLOOR_DEPTH)
     trajectory = _jackknifed(of_trajectory, blocks, LENGTH_SPREAD).not_below(SCALE_FLOOR_TRAJECTORY)
     both = _combined(depth, trajectory)
-    scale = math.exp(both.value)
+    return replace(
+        _aligned(result, result.E_given, math.exp(both.value)),
+        scale_trajectory=math.exp(trajectory.value),
+        scale_depth=math.exp(depth.value),
+        scale_spread=both.spread,
+    )
+
+
+def _aligned(result: SolvedCapture, E_given: np.ndarray, scale: float) -> SolvedCapture:
+    """The capture times a scale, turned and shifted to where the given poses ``(N, 4, 4)`` have it."""
+    centres, given = result.E[:, :3, 3], E_given[:, :3, 3]
     # Directions of view count three times as much as places: places on a line leave a turn about it open.
     reach = 3.0 * float(np.median(np.linalg.norm(given - np.median(given, axis=0), axis=1)))
-    known = (scale * centres, result.E), (given, result.E_given)
+    known = (scale * centres, result.E), (given, E_given)
     _, Q = _similarity(*(np.concatenate([c, *(c + reach * E[:, :3, k] for k in range(3))]) for c, E in known))
     turned = scale * centres @ Q.T
     shift = np.median(given - turned, axis=0)
     E = result.E.copy()
     E[:, :3, :3], E[:, :3, 3] = Q @ E[:, :3, :3], turned + shift
-    return replace(
-        result,
-        E=E,
-        points=scale * result.points @ Q.T + shift,
-        scale_trajectory=math.exp(trajectory.value),
-        scale_depth=math.exp(depth.value),
-        scale_spread=both.spread,
-    )
+    return replace(result, E=E, points=scale * result.points @ Q.T + shift)
 
 
 class _Estimate(NamedTuple):

@@ -122,20 +122,22 @@ def _as_list(given: Any) -> list[Tensor]:
         given = [given] if given.ndim == 2 else list(given)
     if not isinstance(given, (list, tuple)) or not all(isinstance(m, (np.ndarray, Tensor)) for m in given):
         bad_type("depth_map", "an array (h, w) or (N, h, w), or a list of arrays (h, w)", given)
-    maps = []
-    for each in given:
-        values = torch.as_tensor(np.ascontiguousarray(each) if isinstance(each, np.ndarray) else each)
-        if values.ndim != 2 or min(values.shape) < 2 or values.is_complex():
-            bad_value("depth_map", "a map (h, w) of 2 x 2 pixels or more", f"shape {tuple(values.shape)}")
-        # Not float64 for all: Apple's GPUs lack it, and of two float32 the difference is as exact in float32.
-        values = values if values.dtype in (torch.float32, torch.float64) else values.float()
-        inside = values.isfinite()
-        if not inside.any() or values[inside].min() == values[inside].max():
-            cure = "Not finite means unknown; a map must tell near from far somewhere."
-            bad_value("depth_map", "a map with two different finite values", "none", cure)
-        low = values[inside].min()  # before float32, which would round a small range far from 0
-        maps.append(torch.where(inside, values - low, values.new_tensor(torch.nan)).float()[None, None])
-    return maps
+    return [_from_zero(each) for each in given]
+
+
+def _from_zero(given: np.ndarray | Tensor) -> Tensor:
+    """One map less its least value, ``(1, 1, h, w)`` float32, NaN where unknown."""
+    values = torch.as_tensor(np.ascontiguousarray(given) if isinstance(given, np.ndarray) else given)
+    if values.ndim != 2 or min(values.shape) < 2 or values.is_complex():
+        bad_value("depth_map", "a map (h, w) of 2 x 2 pixels or more", f"shape {tuple(values.shape)}")
+    # Not float64 for all: Apple's GPUs lack it, and of two float32 the difference is as exact in float32.
+    values = values if values.dtype in (torch.float32, torch.float64) else values.float()
+    inside = values.isfinite()
+    if not inside.any() or values[inside].min() == values[inside].max():
+        cure = "Not finite means unknown; a map must tell near from far somewhere."
+        bad_value("depth_map", "a map with two different finite values", "none", cure)
+    low = values[inside].min()  # before float32, which would round a small range far from 0
+    return torch.where(inside, values - low, values.new_tensor(torch.nan)).float()[None, None]
 
 
 def _filled(values: Tensor) -> tuple[Tensor, Tensor]:
