@@ -506,6 +506,22 @@ MESSAGES: dict[str, MessageKind] = {
         cause="They lie in none of the usual folders; files of their names lie near it.",
         cure="Check that they are the right ones; if not, give their folder (--images).",
     ),
+    "capture.poses-beside": MessageKind(
+        "Images are read without poses, though there may be some",
+        cause="Beside them lies a file of another program's cameras, or a folder that looks like a capture.",
+        cure="Give the file or folder that the message names, or convert it as it says.",
+    ),
+    "capture.no-poses": MessageKind(
+        "The file of cameras has no pose of any frame",
+        cause="It was written before its images were placed.",
+        cure="Nothing: the poses are solved for. To keep the program's own, export them after alignment.",
+    ),
+    "capture.other-size": MessageKind(
+        "Images are nearly, but not quite, of the size of their cameras",
+        cause="They are other pictures: those before lens distortion was removed, or of another export.",
+        cure="Say where the images lie that the cameras are of (--images), or give the model of these.",
+        forbids_trust=True,
+    ),
     "capture.gps-scale": MessageKind(
         "The capture was aligned with GPS",
         cause="OpenSfM fitted its reconstruction to positions that are exact to some metres.",

@@ -20,6 +20,7 @@ from geodiff_plugin.formats.datasets import (
 )
 from geodiff_plugin.formats.files import PathLike, is_turned, stored_size, upright_size
 from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
+from geodiff_plugin.formats.kapture import read_kapture
 from geodiff_plugin.formats.layouts import (
     NO_POSE,
     Candidate,
@@ -28,8 +29,23 @@ from geodiff_plugin.formats.layouts import (
     Layout,
     unique_names,
 )
-from geodiff_plugin.formats.phones import read_polycam, read_record3d, read_stray
+from geodiff_plugin.formats.openmvg import read_alicevision, read_openmvg
+from geodiff_plugin.formats.phones import (
+    read_arkitscenes,
+    read_polycam,
+    read_record3d,
+    read_scanner_app,
+    read_stray,
+)
 from geodiff_plugin.formats.photogrammetry import read_bundler, read_metashape, read_nvm, read_opensfm
+from geodiff_plugin.formats.radiance import (
+    read_llff,
+    read_nerfies,
+    read_neus,
+    read_nsvf,
+    read_sdfstudio,
+    read_splat_cameras,
+)
 from geodiff_plugin.formats.rigs import RATIO_TOLERANCE, Camera, lens_of, reading_whole, resized
 from geodiff_plugin.formats.sequences import (
     read_photographs,
@@ -39,7 +55,7 @@ from geodiff_plugin.formats.sequences import (
     read_video,
 )
 from geodiff_plugin.formats.transforms import read_transforms
-from geodiff_plugin.formats.unknown import refuse_foreign, refuse_unknown
+from geodiff_plugin.formats.unknown import poses_beside, refuse_foreign, refuse_unknown
 from geodiff_plugin.messages import Message
 
 #: A note names so many of the frames that are left out, at most.
@@ -48,14 +64,27 @@ MOST_NAMES = 5
 LONGEST_NAME = 60
 #: It gives so many of their reasons, at most.
 MOST_REASONS = 3
+#: What to say of a capture of one frame, and of a file that names none.
+ONE_FRAME = "One frame has no second view: use geodiff depth with known points, or record more."
+NO_FRAMES = "Its file names no images: was it written before they were placed?"
+#: Smaller copies of an image have half its sides or less; one that differs by less than this share is another
+#: picture, such as the one before its lens distortion was removed.
+NEAR_SIZE = 0.1
+#: Sides of one picture may differ by rounding, pixels.
+ROUNDING_PX = 1
 
+COLMAP_CAMERAS = ("**/cameras.bin", "**/cameras.txt")
+COLMAP_IMAGES = ("**/images.bin", "**/images.txt")
 #: Every layout; the first that recognises a path reads it.
 LAYOUTS = (
     CaptureFormat("a transforms.json", ("transforms*.json",), read_transforms, names_images=True),
-    CaptureFormat("a COLMAP model", ("**/cameras.*", "**/images.*"), read_colmap_capture, names_images=True),
+    CaptureFormat("a COLMAP model", (COLMAP_CAMERAS, COLMAP_IMAGES), read_colmap_capture, names_images=True),
+    CaptureFormat("3D Gaussian splatting", ("cameras.json",), read_splat_cameras, names_images=True),
     CaptureFormat("Polycam's raw data", ("keyframes/*cameras", "keyframes/*images"), read_polycam),
     CaptureFormat("Record3D", ("metadata.json", "rgb"), read_record3d),
     CaptureFormat("Stray Scanner", ("odometry.csv", "camera_matrix.csv", "rgb.mp4"), read_stray),
+    CaptureFormat("3D Scanner App", ("frame_*.jpg", "frame_*.json"), read_scanner_app),
+    CaptureFormat("ARKitScenes", ("**/lowres_wide", "**/lowres_wide.traj"), read_arkitscenes),
     CaptureFormat("7-Scenes", ("frame-*.color.*", "frame-*.pose.txt"), read_tracked),
     CaptureFormat("ScanNet", ("color", "pose", "intrinsic"), read_tracked),
     CaptureFormat("TUM RGB-D", ("rgb.txt", "groundtruth.txt"), read_tum),
@@ -64,13 +93,21 @@ LAYOUTS = (
     CaptureFormat("TartanAir", ("image_left", "pose_left.txt"), read_tartanair),
     CaptureFormat("KITTI odometry", ("image_[0-3]", "calib.txt", "poses.txt"), read_kitti_odometry),
     CaptureFormat("MVSNet", ("cams/*_cam.txt", "*images"), read_mvsnet_folder),
+    CaptureFormat("NSVF", ("rgb", "pose", "intrinsics*"), read_nsvf),
+    CaptureFormat("NeuS", ("cameras*.npz", "image"), read_neus),
+    CaptureFormat("SDFStudio", ("meta_data.json",), read_sdfstudio, names_images=True),
+    CaptureFormat("Nerfies", ("camera/*.json", "rgb/[0-9]*x"), read_nerfies),
+    CaptureFormat("LLFF", ("poses_bounds.npy", "images"), read_llff),
+    CaptureFormat("kapture", ("**/sensors.txt", "**/records_camera.txt"), read_kapture, names_images=True),
+    CaptureFormat("OpenMVG", ("sfm_data*.json",), read_openmvg, names_images=True),
+    CaptureFormat("Meshroom", ("*.sfm",), read_alicevision, names_images=True),
     CaptureFormat("Metashape", ("*.xml",), read_metashape, names_images=True),
     CaptureFormat("OpenSfM", ("*reconstruction*.json",), read_opensfm, names_images=True),
     CaptureFormat("Bundler", ("*.out", "list*.txt"), read_bundler, names_images=True),
     CaptureFormat("VisualSFM", ("*.nvm",), read_nvm, names_images=True),
     CaptureFormat("Tanks and Temples", ("*.log",), read_log),
-    CaptureFormat("a video", ("*.mp4",), read_video),
-    CaptureFormat("images", ("*.jpg",), read_photographs),
+    CaptureFormat("a video", ("*.mp4",), read_video, has_poses=False),
+    CaptureFormat("images", ("*.jpg",), read_photographs, has_poses=False),
 )
 
 
@@ -109,10 +146,13 @@ def read_capture(
     frames = [each.frame for each in finished if not each.problem]
     is_typed = K is not None or fov is not None
     said = [note for note in layout.notes if not (is_typed and note.code == "capture.assumed-k")]
-    notes = [*_reasons(finished), *said, *_turned(frames)]
+    notes = [*_reasons(finished), *said, *_turned(frames), *_other_sizes(finished)]
+    if layout.has_poses and frames and not tracked:
+        sentence = f"No frame of {layout.kind} has a pose: they are solved for, without a unit."
+        notes.append(Message("capture.no-poses", sentence))
     if len(frames) < 2:
-        alone = "One frame has no second view: use geodiff depth with known points, or record more."
-        bad_value("a capture", "at least two frames", f"{len(frames)} in {source}", " ".join(notes) or alone)
+        cure = " ".join(notes) or (ONE_FRAME if frames else NO_FRAMES)
+        bad_value("a capture", "at least two frames", f"{len(frames)} in {source}", cure)
     named = zip(frames, unique_names(frames), strict=True)
     frames = [replace(frame, name=name) for frame, name in named]
     return frames, layout.kind, layout.unit if tracked else None, notes
@@ -133,7 +173,8 @@ def _layout(source: Path, trajectory: Path | None, images: Path | None) -> Layou
         if images is not None and not each.names_images:
             expected = "left out where no file names the images"
             bad_value("images (--images)", expected, f"{images} for {each.summary}")
-        return layout
+        beside = () if each.has_poses or source.is_file() else poses_beside(source, LAYOUTS)
+        return replace(layout, notes=(*layout.notes, *beside), has_poses=each.has_poses)
     refuse_unknown(source, LAYOUTS)
 
 
@@ -194,6 +235,26 @@ def _turned(frames: Sequence[CaptureFrame]) -> list[Message]:
     said = "their EXIF data say that they are shown turned, but their cameras are those of the stored pixels"
     sentence = f"{_some(turned)}: {said}, and so is the depth that comes out."
     return [Message("capture.stored-pixels", sentence)]
+
+
+def _other_sizes(candidates: Sequence[Candidate]) -> list[Message]:
+    """What to say of images that are nearly, but not quite, of the size that their cameras are for."""
+    other = []
+    for each in candidates:
+        if each.problem or each.camera is None or each.camera.size is None:
+            continue
+        sizes = [np.array([float(side) for side in of]) for of in (each.frame.size, each.camera.size)]
+        off_px = np.abs(sizes[0] - sizes[1])
+        if off_px.max() > ROUNDING_PX and (off_px < NEAR_SIZE * sizes[1]).all():
+            other.append(
+                (each.frame.name, "{}x{}".format(*each.frame.size), "{:.0f}x{:.0f}".format(*sizes[1]))
+            )
+    if not other:
+        return []
+    _, got, expected = other[0]
+    said = f"{_some([name for name, *_ in other])}: an image of {got} where its camera is for {expected}"
+    cure = "Is it the one before its lens distortion was removed? Then say where the others lie (--images)."
+    return [Message("capture.other-size", f"{said}. {cure}")]
 
 
 def _reasons(candidates: Sequence[Candidate]) -> list[Message]:

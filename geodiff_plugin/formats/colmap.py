@@ -77,7 +77,7 @@ CUT_PANORAMA = "Cut its panoramas into pinhole views first (panorama_sfm.py of p
 CAMERA = re.compile(r"^[ \t]*(\d+)[ \t]+([A-Z_]+)[ \t]+(\d+)[ \t]+(\d+)[ \t]+(\S.*)$", re.MULTILINE)
 #: Number, quaternion, translation, camera, name. Lines of keypoints have more numbers where the name stands.
 IMAGE = re.compile(
-    r"^[ \t]*(\d+)((?:[ \t]+[-+.\deE]+){7})[ \t]+(\d+)[ \t]+(?![-+.\deE]+[ \t]+\S)(\S.*)$", re.MULTILINE
+    r"^[ \t]*(\d+)((?:[ \t,]+[-+.\deE]+){7})[ \t,]+(\d+)[ \t,]+(?![-+.\deE]+[ \t,]+\S)(\S.*)$", re.MULTILINE
 )
 #: How COLMAP begins a file of cameras.
 CAMERAS_MARK = "# Camera list with"
@@ -90,6 +90,7 @@ LONGEST_HEAD = 200
 PLACES = (
     ("",),
     ("sparse/*", "sparse"),
+    ("[0-9]*",),
     ("colmap/sparse/*", "colmap/sparse", "colmap"),
     ("dense/sparse", "dense/*/sparse"),
     ("distorted/sparse/*",),
@@ -115,7 +116,7 @@ class PosedImage:
     @property
     def T(self) -> np.ndarray:
         """``(4, 4)`` T_camera_from_world; an error where the numbers are none of a pose."""
-        qw, qx, qy, qz, *place = array_of(self.words.split(), (7,), f"image {self.number}")
+        qw, qx, qy, qz, *place = array_of(self.words.replace(",", " ").split(), (7,), f"image {self.number}")
         return pose_of(Rotation.from_quat([qx, qy, qz, qw]), place)  # refuses zeros
 
 
@@ -201,7 +202,8 @@ def _binary_images(path: Path) -> Iterator[str]:
         yield f"{number} {' '.join(map(repr, pose))} {camera} {name.decode(errors='replace')}"
 
 
-def _camera(number: str, name: str, size: tuple[int, int], words: str) -> Camera:
+def model_camera(number: str, name: str, size: tuple[int, int], words: str) -> Camera:
+    """The camera of a model's name, its ``(width, height)``, and its parameters as text."""
     if name not in MODELS:
         bad_value(f"the model of camera {number}", f"one of {', '.join(MODELS)}", name, UNDISTORT)
     form = MODELS[name]
@@ -228,7 +230,7 @@ def _model(cameras_text: str, images_text: str) -> Model:
     cameras, unusable = dict[int, Camera](), dict[int, str]()
     for number, name, width, height, words in CAMERA.findall(cameras_text):
         try:
-            cameras[int(number)] = _camera(number, name, (int(width), int(height)), words)
+            cameras[int(number)] = model_camera(number, name, (int(width), int(height)), words)
         except InputError as error:
             unusable[int(number)] = str(error)
     return Model(cameras, unusable, _images(images_text))

@@ -43,6 +43,14 @@ def images_in(folder: Path) -> list[Path]:
     return images_of(folder.iterdir()) if os.path.isdir(folder) else []
 
 
+def files_of(path: Path, *patterns: str) -> Iterator[Path]:
+    """The path itself where it is a file of one of the patterns, else those of a folder, in order."""
+    if path.is_file():
+        yield from [path] if any(path.match(pattern) for pattern in patterns) else []
+    else:
+        yield from (file for pattern in patterns for file in sorted(path.glob(pattern)) if file.is_file())
+
+
 def image_folders(*folders: Path) -> list[Path]:
     """Every folder, and those below it that usually hold images."""
     every = [at for folder in folders for at in (folder, *(folder / name for name in IMAGE_FOLDERS))]

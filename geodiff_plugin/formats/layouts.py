@@ -56,7 +56,8 @@ class Candidate:
 class Layout:
     """What a reader returns: ``unit`` is ``"m"`` or ``None``; ``notes`` are for the user.
 
-    ``as_stored`` says in which pixels its cameras are, as ``CaptureFrame.as_stored``.
+    ``as_stored`` says in which pixels its cameras are, as ``CaptureFrame.as_stored``; ``has_poses`` that it
+    is more than images, as ``CaptureFormat.has_poses``.
     """
 
     kind: str
@@ -64,21 +65,24 @@ class Layout:
     candidates: Sequence[Candidate]
     as_stored: bool = True
     notes: tuple[Message, ...] = ()
+    has_poses: bool = True
 
 
 @dataclass(frozen=True)
 class CaptureFormat:
     """One line of ``LAYOUTS``: ``read`` returns ``None`` for a path that is none of this format.
 
-    ``marks`` are patterns of the files and folders by which it is recognised; where nothing is, they say
-    which format comes nearest. ``names_images``: its file names images that may lie anywhere; then ``read``
-    also takes the folder that the user gives for them, or ``None``.
+    ``marks`` are patterns of the files and folders by which it is recognised, in a tuple if one of several is
+    enough; where nothing is recognised, they say which format comes nearest. ``names_images``: its file names
+    images that may lie anywhere; then ``read`` also takes the folder that the user gives for them, or
+    ``None``. ``has_poses``: it is more than images.
     """
 
     summary: str
-    marks: tuple[str, ...]
+    marks: tuple[str | tuple[str, ...], ...]
     read: Callable[..., Layout | None]
     names_images: bool = False
+    has_poses: bool = True
 
 
 def build_frame(frame: CaptureFrame, build: Callable[[CaptureFrame], Candidate]) -> Candidate:

@@ -1,7 +1,9 @@
-"""What scanning apps of phones leave as raw data: Polycam, Record3D, Stray Scanner; all in metres, by ARKit.
+"""What scanning apps of phones leave as raw data, and ARKitScenes; all in metres, by ARKit.
 
 Source: ``process_data/polycam_utils.py`` and ``record3d_utils.py`` of nerfstudio-project/nerfstudio;
-the page on its format of strayrobots/scanner and ``stray_visualize.py`` of kekeblom/StrayVisualizer.
+the page on its format of strayrobots/scanner and ``stray_visualize.py`` of kekeblom/StrayVisualizer;
+``tenFpsDataLoader.py`` of apple/ARKitScenes; for 3D Scanner App other readers of ``cameraPoseARFrame``, some
+of which take it by rows and some by columns.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin.formats.files import read_matrix, read_rows, read_text
@@ -19,12 +22,15 @@ from geodiff_plugin.formats.image_files import images_in
 from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Layout, build_frame
 from geodiff_plugin.formats.recordings import video_facts
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, pose_of, rigid
+from geodiff_plugin.formats.sequences import poses_by_time
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 
 #: Polycam's folders of cameras and of their images, those after its own adjustment first.
 POLYCAM = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 #: Pixels are counted from the corner of the first one, as in nerfstudio, which takes the numbers as they are.
 HALF = 0.5
+#: The entry of 3D Scanner App with a camera-to-world pose.
+SCANNER_POSE = "cameraPoseARFrame"
 
 
 def read_polycam(path: Path) -> Layout | None:
@@ -102,3 +108,63 @@ def read_stray(path: Path) -> Layout | None:
         if number < count:
             candidates.append(build_frame(frame, partial(build, row=row)))
     return Layout("Stray Scanner", "m", candidates)
+
+
+def read_scanner_app(path: Path) -> Layout | None:
+    """3D Scanner App's "all data": ``frame_NUMBER.json`` beside ``frame_NUMBER.jpg``, in OpenGL's axes."""
+    pairs = [
+        (image, image.with_suffix(".json")) for image in images_in(path) if image.stem.startswith("frame_")
+    ]
+    pairs = [(image, file) for image, file in pairs if file.is_file()]
+    if not pairs or SCANNER_POSE not in read_text(pairs[0][1], "PATH"):
+        return None
+    candidates = [
+        build_frame(CaptureFrame(image.stem, image), partial(_scanner_frame, file=file))
+        for image, file in pairs
+    ]
+    return Layout("3D Scanner App", "m", candidates)
+
+
+def _scanner_frame(frame: CaptureFrame, file: Path) -> Candidate:
+    entries = json.loads(read_text(file, f"the camera of {frame.name}"))
+    pose = array_of(entries[SCANNER_POSE], (4, 4), SCANNER_POSE)
+    pose = pose.T if pose[3, :3].any() else pose  # by columns: the place stands in the last row
+    K = array_of(entries["intrinsics"], (3, 3), "intrinsics")
+    K = K.T if K[2, :2].any() else K
+    K[:2, 2] -= HALF
+    depth = file.with_name(f"{file.stem.replace('frame', 'depth', 1)}.png")
+    return Candidate(replace(frame, E=rigid(pose, SCANNER_POSE) @ OPENGL_FROM_OPENCV, depth=depth), Camera(K))
+
+
+def read_arkitscenes(path: Path) -> Layout | None:
+    """A scene of ARKitScenes: ``lowres_wide/``, its ``.traj`` (world-to-camera) and ``.pincam`` files."""
+    for folder in (path, path / f"{path.resolve().name}_frames"):
+        images, file = images_in(folder / "lowres_wide"), folder / "lowres_wide.traj"
+        if images and file.is_file():
+            return _arkitscenes(folder, file, images)
+    return None
+
+
+def _arkitscenes(folder: Path, file: Path, images: list[Path]) -> Layout:
+    rows = array_of([row[:7] for row in read_rows(file, f"{file}", "poses")], (-1, 7), "lines of 7")
+    T = [pose_of(Rotation.from_rotvec(row[1:4]), row[4:]) for row in rows]  # camera from world
+    places = np.array([np.linalg.inv(each) for each in T])
+    quaternions = Rotation.from_matrix(places[:, :3, :3]).as_quat()
+    pose_at = poses_by_time(rows[:, 0], places[:, :3, 3], quaternions)
+    lenses = {_seconds(each): each for each in (folder / "lowres_wide_intrinsics").glob("*.pincam")}
+
+    def build(frame: CaptureFrame) -> Candidate:
+        seconds = _seconds(frame.image)
+        near = min(lenses, key=lambda other: abs(other - seconds))
+        (row,) = read_rows(lenses[near], lenses[near].name, "one line of a camera")
+        width, height, fx, fy, cx, cy = array_of(row, (6,), "a camera")
+        depth = folder / "lowres_depth" / frame.image.name
+        camera = Camera(intrinsics(fx, fy, cx, cy), (int(width), int(height)))
+        return Candidate(replace(frame, E=pose_at(seconds), depth=depth), camera)
+
+    return Layout("ARKitScenes", "m", [build_frame(CaptureFrame(i.stem, i), build) for i in images])
+
+
+def _seconds(file: Path) -> float:
+    """The time in a name such as ``41069021_305.377.png``."""
+    return float(file.stem.rpartition("_")[2])

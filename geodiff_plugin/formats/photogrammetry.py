@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import InputError, bad_value
-from geodiff_plugin.formats.files import check_file, parse_xml, read_text, stored_size
-from geodiff_plugin.formats.image_files import image_folders
+from geodiff_plugin.formats.files import parse_xml, read_text, stored_size
+from geodiff_plugin.formats.image_files import files_of, image_folders
 from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, pose_of, rigid
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
@@ -40,16 +40,8 @@ OPENSFM_LENSES = {
     "fisheye_opencv": ("fisheye", ("k1", "k2", "k3", "k4")),
 }
 #: Names of the list of images that belongs to a file of Bundler.
-LISTS = ("list.txt", "pictures.txt", "bundle.out.list.txt")
+LISTS = ("list.txt", "pictures.txt", "bundle.out.list.txt", "prepare/list.txt", "list_tmp.txt")
 Entries = dict[str, Any]
-
-
-def _files(path: Path, *patterns: str) -> Iterator[Path]:
-    """The path itself where it is a file of one of the patterns, else those of a folder, in order."""
-    if path.is_file():
-        yield from [path] if any(path.match(pattern) for pattern in patterns) else []
-    else:
-        yield from (file for pattern in patterns for file in sorted(path.glob(pattern)) if file.is_file())
 
 
 # Metashape
@@ -57,22 +49,59 @@ def _files(path: Path, *patterns: str) -> Iterator[Path]:
 
 def read_metashape(path: Path, images_at: Path | None = None) -> Layout | None:
     """Metashape's ``cameras.xml``: camera-to-world poses, in metres where the chunk has a scale."""
-    for file in _files(path, "*.xml"):
+    for file in files_of(path, "*.xml"):
         text = read_text(file, "PATH")
         if "<chunk" in text and "<camera" in text:
             return _metashape(file, parse_xml(text), images_at)
     return None
 
 
+@dataclass(frozen=True, eq=False)
+class ChunkPart:
+    """A chunk of Metashape and the component in it whose poses are in one frame; ``None`` in older files."""
+
+    chunk: Element
+    component: str | None
+
+    def cameras(self) -> list[Element]:
+        """Its cameras that have a name, placed or not."""
+        every = [camera for camera in self.chunk.iter("camera") if camera.get("label")]
+        return [camera for camera in every if camera.get("component_id") in (self.component, None)]
+
+    def placed(self) -> int:
+        """How many of them have a pose."""
+        return sum(camera.find("transform") is not None for camera in self.cameras())
+
+    def scale(self) -> float:
+        """Metres of its unit of length; 1 where it has none."""
+        components = self.chunk.iter("component")
+        own = [each for each in components if self.component is None or each.get("id") == self.component]
+        nodes = [node for each in (*own, self.chunk) for node in each.findall("transform/scale")]
+        return next((float(node.text or 1) for node in nodes), 1.0)
+
+
+def _parts(root: Element) -> list[ChunkPart]:
+    """What may have poses in a frame of its own, that with most placed cameras first."""
+    parts = []
+    for chunk in root.iter("chunk"):
+        names = dict.fromkeys(camera.get("component_id") for camera in chunk.iter("camera"))
+        parts += [ChunkPart(chunk, name) for name in names if name is not None or len(names) == 1]
+    return sorted(parts, key=lambda part: -part.placed())
+
+
 def _metashape(file: Path, root: Element, images_at: Path | None) -> Layout:
+    parts = _parts(root)
+    if not parts:
+        cure = "Align the photos in Metashape, then export the cameras again."
+        bad_value("PATH", "Metashape's cameras", f"{file} without a camera", cure)
+    part, others = parts[0], [str(other.placed()) for other in parts[1:] if other.placed()]
     sensors: dict[str | None, Camera | str] = {}
-    for sensor in root.iter("sensor"):
+    for sensor in part.chunk.iter("sensor"):
         try:
             sensors[sensor.get("id")] = _metashape_camera(sensor)
         except InputError as error:
             sensors[sensor.get("id")] = str(error)
-    scale = next((float(node.text or 1) for node in root.iter("scale")), 1.0)
-    cameras = [camera for camera in root.iter("camera") if camera.get("label")]
+    scale, cameras = part.scale(), part.cameras()
     labels = [str(camera.get("label")) for camera in cameras]
     images = Images(labels, image_folders(file.parent), file, images_at)
 
@@ -89,7 +118,12 @@ def _metashape(file: Path, root: Element, images_at: Path | None) -> Layout:
 
     pairs = zip(images.names, cameras, strict=True)
     candidates = [images.candidate(name, partial(build, camera=camera)) for name, camera in pairs]
-    return Layout("Metashape", None if scale == 1.0 else "m", candidates, notes=images.notes)
+    notes = list(images.notes)
+    if others:
+        said = f"The chunk or component with most placed cameras, {part.placed()}, is used"
+        sentence = f"{said}; left out, since each has a frame of its own: those with {', '.join(others)}."
+        notes.append(Message("capture.part", sentence))
+    return Layout("Metashape", None if scale == 1.0 else "m", candidates, notes=tuple(notes))
 
 
 def _metashape_camera(sensor: Element) -> Camera:
@@ -125,7 +159,7 @@ def _metashape_camera(sensor: Element) -> Camera:
 
 def read_opensfm(path: Path, images_at: Path | None = None) -> Layout | None:
     """OpenSfM's ``reconstruction.json``, its largest part; poses are world-to-camera."""
-    for file in _files(path, "*reconstruction*.json", "opensfm/reconstruction.json"):
+    for file in files_of(path, "*reconstruction*.json", "opensfm/reconstruction.json"):
         data = json.loads(read_text(file, "PATH"))
         if data == []:
             bad_value("reconstruction.json", "with images that were placed", f"{file} with none")
@@ -178,7 +212,7 @@ def _opensfm_camera(entries: Entries) -> Camera:
 
 def read_bundler(path: Path, images_at: Path | None = None) -> Layout | None:
     """Bundler's ``bundle.out`` and its list of images: world-to-camera, OpenGL's axes, central cameras."""
-    for file in _files(path, "*.out", "bundle/*.out"):
+    for file in files_of(path, "*.out", "bundle/*.out"):
         with file.open(encoding="utf-8", errors="replace") as opened:
             if opened.readline().startswith("# Bundle file"):
                 return _bundler(file, opened.readline(), opened, images_at)
@@ -187,9 +221,16 @@ def read_bundler(path: Path, images_at: Path | None = None) -> Layout | None:
 
 def _bundler(file: Path, counts: str, lines: Iterator[str], images_at: Path | None) -> Layout:
     above = (file.parent, file.parent.parent)
-    names_of = [folder / name for folder in above for name in (f"{file}.list.txt", *LISTS)]
-    listed = next((each for each in names_of if each.is_file()), names_of[1])
-    text = read_text(check_file(listed, "the list of images"), "the list of images")
+    names_of = [
+        folder / name for folder in above for name in (f"{file}.list.txt", f"{file.stem}.list.txt", *LISTS)
+    ]
+    listed = next((each for each in names_of if each.is_file()), None)
+    if listed is None:
+        cure = "Bundler numbers its images: put the list.txt that it was run with beside it, a name a line."
+        bad_value(
+            "PATH", f"{file.name} with its list of images ({', '.join(LISTS[:2])})", f"{file} without", cure
+        )
+    text = read_text(listed, "the list of images")
     names = [line.split()[0] for line in text.splitlines() if line.strip()]
     count = int(counts.split()[0])
     if count != len(names):
@@ -219,7 +260,7 @@ def _central(frame: CaptureFrame, f: float, coefficients: tuple[float, ...]) -> 
 
 def read_nvm(path: Path, images_at: Path | None = None) -> Layout | None:
     """VisualSFM's NVM: a line an image, with its focal length, world-to-camera quaternion and centre."""
-    for file in _files(path, "*.nvm"):
+    for file in files_of(path, "*.nvm"):
         with file.open(encoding="utf-8", errors="replace") as opened:
             if opened.readline().startswith("NVM_V3"):
                 return _nvm(file, (line for line in opened if line.strip()), images_at)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import dropwhile
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,20 @@ from geodiff_plugin.messages import Message
 TUM_ASSOCIATIONS = ("associations.txt", "associated.txt", "association.txt")
 SEVEN_SCENES = Camera(intrinsics(525.0, 525.0, 320.0, 240.0), (640, 480))
 TUM_RGBD = Camera(intrinsics(525.0, 525.0, 319.5, 239.5), (640, 480))
+#: The three cameras of TUM RGB-D as its authors calibrated them; the third one's images are straightened.
+FREIBURG = {
+    "1": Camera(
+        intrinsics(517.3, 516.5, 318.6, 255.3), (640, 480), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+    ),
+    "2": Camera(
+        intrinsics(520.9, 521.0, 325.1, 249.7), (640, 480), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)
+    ),
+    "3": Camera(intrinsics(535.4, 539.2, 320.1, 247.6), (640, 480)),
+}
+#: How folders and the heads of files name one of them.
+FREIBURG_NAME = re.compile(r"freiburg([123])_", re.IGNORECASE)
+#: Numbers of ETH3D's ``calibration.txt``: fx, fy, cx, cy; and lens coefficients where there are any.
+FOCALS_AND_CENTRE = 4
 
 
 @dataclass(frozen=True)
@@ -49,7 +64,10 @@ TRACKED = {
     "7-Scenes": OnePoseAFile("frame-*.color.*", "{}.pose.txt", "{}.depth.png", SEVEN_SCENES),
     "ScanNet": OnePoseAFile("color/*", "pose/{}.txt", "depth/{}.png"),
 }
-INTRINSICS = "intrinsics.txt camera-intrinsics.txt K.txt intrinsic/intrinsic_color.txt intrinsic_color.txt"
+INTRINSICS = (
+    *("calibration.txt", "intrinsics.txt", "camera-intrinsics.txt", "K.txt"),
+    *("intrinsic/intrinsic_color.txt", "intrinsic_color.txt"),
+)
 #: Where ScanNet's and 12-Scenes' recorder, and 3RScan, write the cameras of their frames.
 INFOS = ("_info.txt", "info.txt")
 #: Its lines, ``name = value``.
@@ -66,6 +84,10 @@ REPLICA_CAMERA = "cam_params.json"
 TUM_DEPTH = 5000.0
 #: Poses of a trajectory further from an image than this, in seconds, are not its own.
 FARTHEST_S = 0.05
+#: A number, as a row of a list begins.
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
+#: Letters of a file's head, in which its sequence is named.
+HEAD = 300
 VIDEO = "video"
 #: The camera-to-world pose at a time in seconds; ``None`` where none is near.
 PoseAt = Callable[[float], np.ndarray | None]
@@ -76,9 +98,14 @@ def _file_camera(folder: Path, published: Camera | None) -> Camera | None:
     info = _info_of(folder)
     if info is not None:
         return info.camera
-    files = [parent / name for parent in (folder, folder.parent) for name in INTRINSICS.split()]
+    files = [parent / name for parent in (folder, folder.parent) for name in INTRINSICS]
     file = next((file for file in files if file.is_file()), None)
-    return published if file is None else Camera(read_matrix(file, f"{file}")[:3, :3])
+    if file is None:
+        return published
+    rows = read_rows(file, f"{file}", "a camera")
+    if len(rows) == 1 and len(rows[0]) == FOCALS_AND_CENTRE:
+        return Camera(intrinsics(*rows[0]))
+    return Camera(read_matrix(file, f"{file}")[:3, :3])
 
 
 def _assumed(kind: str, camera: Camera | None) -> tuple[Message, ...]:
@@ -171,7 +198,7 @@ def read_tum(folder: Path) -> Layout | None:
     associations = next((file for name in TUM_ASSOCIATIONS if (file := folder / name).is_file()), None)
     if not ((folder / "rgb.txt").is_file() or associations) or not (folder / "groundtruth.txt").is_file():
         return None
-    camera, candidates = _file_camera(folder, TUM_RGBD), list[Candidate]()
+    camera, candidates = _file_camera(folder, _freiburg(folder)), list[Candidate]()
     pose_at = read_trajectory(folder / "groundtruth.txt")
     if associations is not None and not (folder / "rgb.txt").is_file():
         images, depths = _associated_names(associations)
@@ -186,15 +213,29 @@ def read_tum(folder: Path) -> Layout | None:
     return Layout("TUM RGB-D", "m", candidates, notes=_assumed("TUM RGB-D", camera))
 
 
+def _freiburg(folder: Path) -> Camera:
+    """The camera that the name of a sequence of TUM RGB-D says, or the head of one of its files."""
+    heads = [folder / "rgb.txt", folder / "groundtruth.txt"]
+    texts = [folder.resolve().name, *(read_text(file, f"{file}")[:HEAD] for file in heads if file.is_file())]
+    found = next(filter(None, map(FREIBURG_NAME.search, texts)), None)
+    return TUM_RGBD if found is None else FREIBURG[found[1]]
+
+
+def _below_heading(rows: list[list[str]]) -> list[list[str]]:
+    """The rows from the first one on that begins with a number: headings may lack their ``#``."""
+    return list(dropwhile(lambda row: NUMBER.fullmatch(row[0]) is None, rows))
+
+
 def _timed_names(file: Path) -> list[tuple[float, str]]:
     with reading_whole(file, "list of seconds and file names"):
-        return [(float(t), name) for t, name, *_ in read_rows(file, f"{file}", "seconds and file names")]
+        rows = _below_heading(read_rows(file, f"{file}", "seconds and file names"))
+        return [(float(t), name) for t, name, *_ in rows]
 
 
 def _associated_names(file: Path) -> tuple[list[tuple[float, str]], list[tuple[float, str]]]:
     """Images and depth maps with their seconds, of lines that have one of each, in either order."""
     with reading_whole(file, "list of seconds and file names, twice a line"):
-        rows = [row[:4] for row in read_rows(file, f"{file}", "seconds and file names")]
+        rows = [row[:4] for row in _below_heading(read_rows(file, f"{file}", "seconds and file names"))]
         pairs = [((float(t), name), (float(s), other)) for t, name, s, other in rows]
     depth_first = any(Path(name).parent.name.startswith("depth") for (_, name), _ in pairs)
     first, second = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
@@ -204,7 +245,7 @@ def _associated_names(file: Path) -> tuple[list[tuple[float, str]], list[tuple[f
 def read_trajectory(file: Path) -> PoseAt:
     """Poses of a trajectory in TUM's form, lines ``seconds tx ty tz qx qy qz qw``, camera-to-world."""
     with reading_whole(file, "trajectory of lines seconds tx ty tz qx qy qz qw"):
-        lines = [words[:8] for words in read_rows(file, f"{file}", "a trajectory")]
+        lines = [words[:8] for words in _below_heading(read_rows(file, f"{file}", "a trajectory"))]
         rows = array_of(lines, (-1, 8), "lines of 8")
         return poses_by_time(rows[:, 0], rows[:, 1:4], rows[:, 4:])
 

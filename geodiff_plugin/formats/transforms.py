@@ -43,6 +43,8 @@ NERF_LENSES = {
 NERF_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 #: With these entries the poses come from structure from motion.
 OF_COLMAP = ("colmap_im_id", "sharpness")
+#: A last number of a pose further from 1 than this is a scale that was multiplied in.
+SCALED = 1e-3
 #: Files of a folder, the first that is there: nerfstudio's, NeRF's rendered scenes, ScanNet++'s.
 FILES = (
     "transforms.json",
@@ -134,6 +136,15 @@ def nerf_pose(frame: Frame) -> np.ndarray | None:
     return pose
 
 
+def _is_scaled(frame: Frame) -> bool:
+    """Whether a homogeneous matrix was multiplied by a factor: lengths were scaled, nobody says from what."""
+    matrix = frame.get("transform_matrix")
+    if matrix is None or _unknown(matrix):
+        return False
+    numbers = array_of(matrix, (-1,), "transform_matrix")
+    return numbers.size == 16 and abs(numbers[15] - 1) > SCALED
+
+
 def _unknown(matrix: Any) -> bool:
     """Whether a matrix holds null or NaN anywhere."""
     rows = matrix if isinstance(matrix, list) else [matrix]
@@ -163,7 +174,7 @@ def read_transforms(path: Path, images_at: Path | None = None) -> Layout | None:
         images.candidate(name, partial(_build, entries=entries, folder=file.parent))
         for name, entries in zip(images.names, frames, strict=True)
     ]
-    solved = any(key in entries for entries in frames for key in OF_COLMAP)
+    solved = any(key in entries for entries in frames for key in OF_COLMAP) or any(map(_is_scaled, frames))
     notes = (*_notes(file), *images.notes)
     return Layout(TRANSFORMS, None if solved else "m", candidates, as_stored=True, notes=notes)
 
@@ -221,7 +232,8 @@ def _notes(file: Path) -> tuple[Message, ...]:
     others = sorted(other.name for other in file.parent.glob("transforms_*.json") if other != file)
     if not file.name.startswith("transforms_train") or not others:
         return ()
-    sentence = f"{file.name} is read; {', '.join(others)} beside it are not."
+    verb = "are" if len(others) > 1 else "is"
+    sentence = f"{file.name} is read; {', '.join(others)} beside it {verb} not."
     return (Message("capture.part", sentence),)
 
 

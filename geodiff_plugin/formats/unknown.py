@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,25 +12,42 @@ from pathlib import Path
 from typing import NoReturn
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.files import check_file
 from geodiff_plugin.formats.layouts import CaptureFormat
+from geodiff_plugin.messages import Message
 
 #: Files of a folder that are looked at: listing a whole disk takes long.
 MOST_FILES = 2000
 #: Kinds of files that a message gives.
 MOST_KINDS = 6
+#: Folders in it that are compared with the formats.
+MOST_FOLDERS = 20
+#: Files of one mark whose beginnings are compared.
+MOST_LOOKED_AT = 5
+#: Bytes of a beginning.
+HEAD_BYTES = 4096
+#: The share of a format's marks from which it counts as near.
+LEAST_MARKS = 0.5
 
 
 @dataclass(frozen=True)
 class ForeignFormat:
-    """A format that is not read: names of its files, what it is, and what converts it."""
+    """A format that is not read: names of its files, what it is, and what converts it.
+
+    ``content`` is a regular expression that the beginning of such a file has, where names alone do not tell.
+    ``has_poses``: it may hold poses of the photographs beside it.
+    """
 
     marks: tuple[str, ...]
     name: str
     cure: str
+    content: str = ""
+    has_poses: bool = True
 
 
 SENS = "SensReader's reader.py --export_color_images --export_poses --export_intrinsics writes what is read."
 MAPPER = "Run: colmap mapper --database_path database.db --image_path images --output_path sparse."
+COLMAP_EXPORT = "Export its registration as COLMAP."
 PSX = "In Metashape: File, Export, Export Cameras, as Agisoft XML."
 FOREIGN = (
     ForeignFormat(("*.sens",), "a sequence of ScanNet", SENS),
@@ -36,22 +55,56 @@ FOREIGN = (
     ForeignFormat(("*.psx", "*.psz"), "a project of Metashape", PSX),
     ForeignFormat(("*.vrs",), "a recording of Project Aria", "Export images and poses by projectaria_tools."),
     ForeignFormat(
-        ("sfm_data.json", "sfm_data.bin"),
+        ("sfm_data*.bin",),
         "a reconstruction of OpenMVG",
-        "Run: openMVG_main_openMVG2Colmap -i sfm_data.bin -o sparse.",
+        "Run: openMVG_main_ConvertSfM_DataFormat -i sfm_data.bin -o sfm_data.json -V -I -E.",
     ),
-    ForeignFormat(("*.sfm",), "a reconstruction of Meshroom", "Run: aliceVision_exportColmap."),
+    ForeignFormat(("*.mg",), "a project of Meshroom", "Give cameras.sfm of its StructureFromMotion folder."),
     ForeignFormat(("*.mvs",), "a scene of OpenMVS", "Give the COLMAP model that it was made from."),
     ForeignFormat(("database.db",), "COLMAP's matches without a model", MAPPER),
-    ForeignFormat(
-        ("cameras_sphere.npz", "cameras.npz"),
-        "cameras of NeuS and IDR",
-        "Split world_mat @ scale_mat by cv2.decomposeProjectionMatrix and write transforms.json.",
-    ),
     ForeignFormat(("*_annotations.jgz",), "annotations of CO3D", "Write a sequence as transforms.json."),
-    ForeignFormat(("poses_bounds.npy",), "poses of LLFF", "Give the COLMAP model that they were made from."),
     ForeignFormat(("*.svo", "*.svo2"), "a recording of ZED", "Export it as a video with ZED_SVO_Editor."),
-    ForeignFormat(("*.rcproj",), "a project of RealityCapture", "Export its registration as COLMAP."),
+    ForeignFormat(("*.rcproj",), "a project of RealityCapture", COLMAP_EXPORT),
+    ForeignFormat(("*.csv",), "cameras of RealityCapture", COLMAP_EXPORT, r"\A#(name,x,y|cameras \d)"),
+    ForeignFormat(("*.xmp",), "a camera of RealityCapture", COLMAP_EXPORT, r"xcr:Rotation|capturingreality"),
+    ForeignFormat(
+        ("*.xml",),
+        "a block of ContextCapture (BlocksExchange)",
+        "Export it for COLMAP, or its images without distortion with transforms.json.",
+        r"<BlocksExchange",
+    ),
+    ForeignFormat(
+        ("*_calibrated_camera_parameters.txt",),
+        "cameras of Pix4D",
+        "Write them as transforms.json: R is from the world to the camera, t the place of the camera.",
+    ),
+    ForeignFormat(
+        ("shots.geojson",),
+        "shots of OpenDroneMap",
+        "Give the project: its opensfm/reconstruction.json has the same cameras.",
+    ),
+    ForeignFormat(
+        ("*.json",),
+        "a trajectory of Open3D",
+        "Write it as transforms.json: its extrinsics are from the world to the camera, by columns.",
+        r'"PinholeCameraTrajectory"',
+    ),
+    ForeignFormat(
+        ("intri.yml", "extri.yml"),
+        "cameras of EasyMocap",
+        "Put one moment's image of each camera into a folder with transforms.json.",
+    ),
+    ForeignFormat(
+        ("KeyFrameData",),
+        "a recording of 4Seasons",
+        "Write its camToWorld as transforms.json, or give undistorted_images/cam0 with --K.",
+    ),
+    ForeignFormat(
+        ("extrinsic.txt",),
+        "cameras of Virtual KITTI",
+        "Give two images to geodiff depth, with --calib intrinsic.txt --calib extrinsic.txt.",
+        r"\Aframe\s+cameraID",
+    ),
     ForeignFormat(
         ("rtabmap*.db",),
         "a database of RTAB-Map",
@@ -71,13 +124,20 @@ FOREIGN = (
         ("*.zip", "*.tar", "*.tgz", "*.tar.gz", "*.7z", "*.rar"),
         "an archive",
         "Unpack it and give its folder.",
+        has_poses=False,
     ),
     ForeignFormat(
         ("*.ply", "*.splat", "*.spz", "*.obj", "*.glb", "*.usdz"),
         "a model without its photographs",
         "Give the photographs with their cameras.",
+        has_poses=False,
     ),
-    ForeignFormat(("*.pkl", "*.pickle", "*.pt"), "pickled objects", "They are never loaded: save .npz."),
+    ForeignFormat(
+        ("*.pkl", "*.pickle", "*.pt"),
+        "pickled objects",
+        "They are never loaded: save .npz.",
+        has_poses=False,
+    ),
 )
 
 
@@ -85,7 +145,7 @@ def refuse_foreign(source: Path) -> None:
     """Refuse a file of a format that is known and not read."""
     if source.is_file():
         for each in FOREIGN:
-            if any(source.match(mark) for mark in each.marks):
+            if any(source.match(mark) for mark in each.marks) and _has_content(source, each.content):
                 bad_value("PATH", "a capture that is read", f"{source}, {each.name}", each.cure)
 
 
@@ -93,9 +153,29 @@ def refuse_unknown(source: Path, formats: Sequence[CaptureFormat]) -> NoReturn:
     """Refuse a path that no reader recognises: what was looked for, what is there, and what comes nearest."""
     expected = ", ".join(each.summary for each in formats)
     if source.is_file():
+        check_file(source, "PATH", expected)  # what failed downloads leave has a cure of its own
         bad_value("PATH", expected, f"{source}, which is none of these")
-    cure = " ".join(filter(None, [_foreign(source), _nearest(source, formats)]))
+    posed = [each for each in formats if each.has_poses]
+    hints = [_foreign(source), _inside(source, posed), _nearest(source, posed)]
+    cure = " ".join(filter(None, hints)) or _inside(source, formats)
     bad_value("PATH", expected, f"{source}, which is none of these: it holds {_content(source)}", cure)
+
+
+def poses_beside(folder: Path, formats: Sequence[CaptureFormat]) -> tuple[Message, ...]:
+    """What to say of a folder whose images are read without poses, though it may hold some."""
+    posed = [each for each in formats if each.has_poses]
+    hints = [_foreign(folder, only_poses=True), _inside(folder, posed)]
+    said = " ".join(filter(None, hints))
+    return (Message("capture.poses-beside", f"Images are read, without poses. {said}"),) if said else ()
+
+
+def _has_content(file: Path, content: str) -> bool:
+    """Whether the beginning of a file has a regular expression; any has an empty one."""
+    if not content:
+        return True
+    with file.open("rb") as opened:
+        head = opened.read(HEAD_BYTES).decode("utf-8-sig", errors="replace")
+    return re.search(content, head) is not None
 
 
 def _content(folder: Path) -> str:
@@ -107,27 +187,51 @@ def _content(folder: Path) -> str:
     return ", ".join(said) or "nothing"
 
 
-def _foreign(folder: Path) -> str:
+def _foreign(folder: Path, only_poses: bool = False) -> str:
     """What a file of a format that is known and not read is, and what converts it."""
     for each in FOREIGN:
-        found = next((path for mark in each.marks for path in sorted(folder.glob(mark))), None)
-        if found is not None:
-            return f"{found.name} is {each.name}. {each.cure}"
+        if only_poses and not each.has_poses:
+            continue
+        found = (path for mark in each.marks for path in sorted(folder.glob(mark))[:MOST_LOOKED_AT])
+        file = next((path for path in found if not each.content or _is_like(path, each.content)), None)
+        if file is not None:
+            return f"{file.name} is {each.name}. {each.cure}"
     return ""
 
 
-def _nearest(folder: Path, formats: Sequence[CaptureFormat]) -> str:
-    """A folder inside that looks like a capture, else the format of whose marks the most are there."""
-    inside = sorted(path for path in islice(folder.iterdir(), MOST_FILES) if path.is_dir())
-    for below in inside[:MOST_KINDS]:
-        for each in formats:
-            if all(any(below.glob(mark)) for mark in each.marks):
-                return f"{below.name}/ looks like {each.summary}: give that folder."
-    best, said = (0.0, 0), ""
+def _is_like(path: Path, content: str) -> bool:
+    return path.is_file() and os.access(path, os.R_OK) and _has_content(path, content)
+
+
+def _inside(folder: Path, formats: Sequence[CaptureFormat]) -> str:
+    """A folder inside that looks like a capture of one of the formats."""
+    inside = sorted(path for path in islice(folder.iterdir(), MOST_FILES) if path.is_dir())[:MOST_FOLDERS]
     for each in formats:
-        lacking = [mark for mark in each.marks if not any(folder.glob(mark))]
-        files = sum("." in mark and mark not in lacking for mark in each.marks)  # say more than folders
-        score = 1 - len(lacking) / len(each.marks), files
+        for below in inside:
+            if all(_has(below, mark) for mark in each.marks):
+                return f"{below.name}/ looks like {each.summary}: give that folder."
+    return ""
+
+
+def _patterns(mark: str | tuple[str, ...]) -> tuple[str, ...]:
+    return (mark,) if isinstance(mark, str) else mark
+
+
+def _has(folder: Path, mark: str | tuple[str, ...]) -> bool:
+    return any(any(folder.glob(pattern)) for pattern in _patterns(mark))
+
+
+def _nearest(folder: Path, formats: Sequence[CaptureFormat]) -> str:
+    """The format of whose marks the most are there, if that is half of them."""
+    best, said = (LEAST_MARKS, 0), ""
+    for each in formats:
+        lacking = [_patterns(mark) for mark in each.marks if not _has(folder, mark)]
+        there = [_patterns(mark) for mark in each.marks if _has(folder, mark)]
+        files = sum("." in patterns[0] for patterns in there)  # say more than folders
+        score = len(there) / len(each.marks), files
         if lacking and score > best:
-            best, said = score, f"Nearest is {each.summary}, which also has {', '.join(lacking)}."
+            also = ", ".join(
+                " or ".join(each.removeprefix("**/") for each in patterns) for patterns in lacking
+            )
+            best, said = score, f"Nearest is {each.summary}, which also has {also}."
     return said

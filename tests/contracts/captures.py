@@ -269,9 +269,40 @@ def three_rscan(folder: Path) -> Twin:
     return Twin(folder, has_depth=True, file="_info.txt")
 
 
+def scanner_app(folder: Path) -> Twin:
+    """All data of 3D Scanner App, whose matrices stand in rows; one frame was recorded without its image."""
+    pictures(folder, [f"frame_{i:05d}.png" for i in range(4)])
+    depths(folder, [f"depth_{i:05d}.png" for i in range(4)])
+    for i, E in enumerate([*TRUE, TRUE[0]]):
+        entries = {"cameraPoseARFrame": (E @ FLIP).ravel().tolist(), "frame_index": i, "motionQuality": 0.9}
+        entries["intrinsics"] = (K + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]).ravel().tolist()
+        (folder / f"frame_{i:05d}.json").write_text(json.dumps(entries))
+    return Twin(folder, has_depth=True, file="frame_00002.json")
+
+
+def arkitscenes(folder: Path) -> Twin:
+    frames = folder / f"{folder.name}_frames"
+    times = [f"{305.377 + 0.1 * i:.3f}" for i in range(4)]
+    names = [f"{folder.name}_{t}" for t in times]
+    pictures(frames / "lowres_wide", [f"{name}.png" for name in names])
+    depths(frames / "lowres_depth", [f"{name}.png" for name in names])
+    (frames / "lowres_wide_intrinsics").mkdir()
+    rows = []
+    for t, E in zip(times, TRUE, strict=True):
+        T = np.linalg.inv(E)
+        rows.append(f"{t} {words([*Rotation.from_matrix(T[:3, :3]).as_rotvec(), *T[:3, 3]])}")
+        near = f"{float(t) - 0.001:.3f}"  # its clock is off by a millisecond
+        numbers = words([*SIZE, K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+        (frames / "lowres_wide_intrinsics" / f"{folder.name}_{near}.pincam").write_text(numbers)
+    (frames / "lowres_wide.traj").write_text("\n".join(rows) + "\n")
+    return Twin(folder, has_depth=True, file=f"{frames.name}/lowres_wide.traj")
+
+
 WRITERS = (
     replica,
     three_rscan,
+    scanner_app,
+    arkitscenes,
     *(polycam, record3d, stray, euroc, tartanair, kitti_odometry, mvsnet),
     *(metashape, opensfm, bundler, nvm, log),
 )

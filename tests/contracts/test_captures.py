@@ -1,5 +1,6 @@
 """Every reader of captures: a walk is read as its program writes it, and damaged files get a sentence."""
 
+import json
 import shutil
 
 import numpy as np
@@ -10,25 +11,33 @@ from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.formats.captures import LAYOUTS, read_capture
 from geodiff_plugin.formats.lenses import undistorted_pixels
 from geodiff_plugin.formats.unknown import FOREIGN
+from tests.contracts import captures_of_fields, captures_of_sfm
 from tests.contracts.captures import (
     CENTRAL,
     TRUE,
-    WRITERS,
     Twin,
+    bundler,
     euroc,
     kitti_odometry,
     log,
     metashape,
     nvm,
     replica,
+    scanner_app,
     stray,
     tartanair,
     three_rscan,
 )
+from tests.contracts.captures import WRITERS as OF_SETS
+from tests.contracts.captures_of_fields import llff, nerf_plus_plus, nerfies, neus, nsvf, splats
+from tests.contracts.captures_of_sfm import alicevision, openmvg
 from tests.unit.capture_room import SIZE, K, render
 
 #: Where the order of the images is all that tells which pose is whose, and where they are a video.
-BY_ORDER = (tartanair, kitti_odometry, log, stray, replica)
+BY_ORDER = (tartanair, kitti_odometry, log, stray, replica, llff, neus, nsvf, nerf_plus_plus)
+WRITERS = (*OF_SETS, *captures_of_fields.WRITERS, *captures_of_sfm.WRITERS)
+#: Of ``K``, the middle that every camera of the walk has.
+CENTRE = K[:2, 2]
 NAMES = [write.__name__ for write in WRITERS]
 
 
@@ -66,17 +75,19 @@ def test_a_lost_image_leaves_out_its_frame_alone(write, tmp_path):
     np.testing.assert_allclose(left.frames[1].E, TRUE[2], atol=1e-6)
 
 
-@pytest.mark.parametrize("write", [tartanair, kitti_odometry, log])
+@pytest.mark.parametrize("write", [tartanair, kitti_odometry, log, llff, nsvf])
 def test_an_image_lost_from_what_is_matched_by_order_is_refused(write, tmp_path):
     twin = write(tmp_path / "scan")
     opened(twin).frames[1].image.unlink()
-    with pytest.raises(InputError, match="of (the )?3 (lines|images)"):
+    with pytest.raises(
+        InputError, match="of (the )?3 (lines|images)|there are images \\(3\\)|one for each image"
+    ):
         opened(twin)
 
 
 def test_every_layout_has_a_twin_here_or_beside_its_own_tests():
     others = {"a transforms.json", "a COLMAP model", "7-Scenes", "ScanNet", "TUM RGB-D", "a video", "images"}
-    again = {three_rscan}  # read as 7-Scenes are
+    again = {three_rscan, nerf_plus_plus}  # read as 7-Scenes and NSVF are
     assert len(LAYOUTS) == len(set(WRITERS) - again) + len(others)
 
 
@@ -140,10 +151,24 @@ def test_what_has_cameras_but_no_poses_says_so(tmp_path):
         opened(Twin(tmp_path))
 
 
+#: The beginning of a file of formats that a name alone does not tell.
+CONTENTS = {
+    "cameras of RealityCapture": "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n",
+    "a camera of RealityCapture": "<x:xmpmeta><rdf:Description><xcr:Rotation>1 0 0</xcr:Rotation>",
+    "a block of ContextCapture (BlocksExchange)": '<?xml version="1.0"?>\n<BlocksExchange version="3.2">',
+    "a trajectory of Open3D": '{"class_name": "PinholeCameraTrajectory", "parameters": []}',
+    "cameras of Virtual KITTI": "frame cameraID r1,1 r1,2 r1,3 t1\n",
+}
+
+
+def test_formats_told_by_their_content_have_an_example_here():
+    assert {each.name for each in FOREIGN if each.content} == set(CONTENTS)
+
+
 @pytest.mark.parametrize("foreign", FOREIGN, ids=lambda each: each.marks[0])
 def test_a_known_format_that_is_not_read_names_what_converts_it(foreign, tmp_path):
     name = foreign.marks[0].replace("*", "scan")
-    (tmp_path / name).write_bytes(b"x")
+    (tmp_path / name).write_text(CONTENTS.get(foreign.name, "x"))
     with pytest.raises(InputError) as caught:
         read_capture(tmp_path)
     assert foreign.name in str(caught.value) and foreign.cure in str(caught.value)
@@ -183,3 +208,153 @@ def test_typed_intrinsics_go_before_those_of_a_file(tmp_path):
     np.testing.assert_allclose(
         Capture.open(twin.path, fov=60.0).frames[0].K[0, 0], SIZE[0] / 2 / np.tan(np.pi / 6)
     )
+
+
+def test_two_frames_of_reference_in_one_file_of_metashape_are_not_mixed(tmp_path):
+    """Each component has a scale and a frame of its own; the one with most placed cameras is taken."""
+    folder = metashape(tmp_path / "scan").path
+    text = (folder / "cameras.xml").read_text()
+    alone = text.replace('id="3" sensor_id="0" component_id="0"', 'id="3" sensor_id="0" component_id="1"')
+    other = '<component id="1"><transform><scale>40</scale></transform></component>'
+    (folder / "cameras.xml").write_text(alone.replace('active_id="0">', f'active_id="0">{other}'))
+    capture = Capture.open(folder)
+    assert len(capture) == 3 and [note.code for note in capture.notes] == ["capture.part"]
+    for frame, E in zip(capture.frames, TRUE, strict=False):
+        np.testing.assert_allclose(frame.E, E, atol=1e-6)
+
+
+def bent(x: np.ndarray, y: np.ndarray, radial: tuple[float, ...], p1: float, p2: float) -> np.ndarray:
+    """Normalised coordinates behind a lens, as the sources of OpenMVG, AliceVision and Nerfies write it."""
+    r2 = x**2 + y**2
+    along = 1 + radial[0] * r2 + radial[1] * r2**2 + radial[2] * r2**3
+    return np.stack(
+        [
+            x * along + p2 * (r2 + 2 * x**2) + 2 * p1 * x * y,
+            y * along + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
+        ],
+        axis=1,
+    )
+
+
+@pytest.mark.parametrize(
+    ("write", "old", "new"),
+    [
+        (openmvg, '"disto_t2": [0.0, 0.0, 0.0, 0.0, 0.0]', '"disto_t2": [0.1, -0.02, 0.03, 0.01, -0.02]'),
+        (
+            alicevision,
+            '"type": "radial3"',
+            '"type": "brown", "distortionParams": [0.1, -0.02, 0.03, 0.01, -0.02], "x": 0',
+        ),
+        (
+            nerfies,
+            '"radial_distortion": [0.0, 0.0, 0.0], "tangential_distortion": [0.0, 0.0]',
+            '"radial_distortion": [0.1, -0.02, 0.03], "tangential_distortion": [0.01, -0.02]',
+        ),
+    ],
+    ids=["openmvg", "alicevision", "nerfies"],
+)
+def test_lenses_bend_as_their_programs_say(write, old, new, tmp_path):
+    twin = write(tmp_path / "scan")
+    for file in [twin.path / twin.file, *twin.path.glob("camera/*")]:
+        text = file.read_text().replace('"distortionParams": ["0", "0", "0"], ', "")
+        file.write_text(text.replace(old, new))
+    frame = opened(twin).frames[0]
+    x, y = np.random.default_rng(0).uniform(-0.4, 0.4, (2, 40))
+    focal, centre = np.diag(frame.K)[:2], frame.K[:2, 2]
+    taken = bent(x, y, (0.1, -0.02, 0.03), 0.01, -0.02) * focal + centre
+    straight = np.stack([x, y], axis=1) * focal + centre
+    np.testing.assert_allclose(undistorted_pixels(taken, frame.K, frame.lens), straight, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("version", "entries", "expected"),
+    [
+        (["1", "1", "0"], {"pxFocalLength": "210", "principalPoint": ["118", "91"]}, (210.0, 210.0)),
+        (["1", "2", "1"], {"pxFocalLength": ["210", "205"]}, (210.0, 205.0)),
+        (["1", "2", "3"], {"focalLength": "5.6", "pixelRatio": "1.25"}, (210.0, 168.0)),
+        (["1", "2", "6"], {"focalLength": "5.6", "pixelRatio": "1.25"}, (210.0, 262.5)),
+        (["1", "2", "11"], {"focalLength": "5.6", "pixelRatio": "1.25"}, (168.0, 210.0)),
+    ],
+)
+def test_focal_lengths_of_alicevision_are_those_of_its_version(version, entries, expected, tmp_path):
+    twin = alicevision(tmp_path / "scan")
+    data = json.loads((twin.path / "cameras.sfm").read_text())
+    data["version"] = version
+    camera = {key: value for key, value in data["intrinsics"][0].items() if key != "pixelRatio"}
+    data["intrinsics"] = [camera | entries]
+    (twin.path / "cameras.sfm").write_text(json.dumps(data))
+    K = opened(twin).frames[0].K
+    np.testing.assert_allclose((K[0, 0], K[1, 1]), expected, rtol=1e-9)
+    np.testing.assert_allclose(K[:2, 2], CENTRE, atol=1e-6)
+
+
+def test_an_upright_camera_of_alicevision_is_refused_with_what_converts_it(tmp_path):
+    twin = alicevision(tmp_path / "scan")
+    text = (twin.path / "cameras.sfm").read_text()
+    upright = text.replace(f'"width": "{SIZE[0]}"', '"width": "90"')
+    (twin.path / "cameras.sfm").write_text(upright)
+    with pytest.raises(InputError, match="wider than high.*aliceVision_exportColmap"):
+        opened(twin)
+
+
+def test_matrices_of_3d_scanner_app_are_told_to_stand_in_rows_or_columns(tmp_path):
+    twin = scanner_app(tmp_path / "scan")
+    for file in twin.path.glob("*.json"):
+        entries = json.loads(file.read_text())
+        entries["cameraPoseARFrame"] = np.reshape(entries["cameraPoseARFrame"], (4, 4)).T.ravel().tolist()
+        entries["intrinsics"] = np.reshape(entries["intrinsics"], (3, 3)).T.ravel().tolist()
+        file.write_text(json.dumps(entries))
+    for frame, E in zip(opened(twin).frames, TRUE, strict=True):
+        np.testing.assert_allclose(frame.E, E, atol=1e-6)
+        np.testing.assert_allclose(frame.K, K, atol=1e-6)
+
+
+def test_poses_that_are_not_read_beside_images_are_said(tmp_path):
+    folder = splats(tmp_path / "scan").path.parent
+    notes = read_capture(folder, fov=60.0)[3]
+    assert [note.code for note in notes] == ["capture.poses-beside"]
+    assert "output/ looks like 3D Gaussian splatting: give that folder" in notes[0]
+    (folder / "output" / "cameras.json").rename(folder / "sfm_data.bin")
+    (note,) = read_capture(folder, fov=60.0)[3]
+    assert "sfm_data.bin is a reconstruction of OpenMVG" in note
+    (folder / "sfm_data.bin").unlink()
+    assert not read_capture(folder, fov=60.0)[3]
+
+
+def test_a_file_that_was_written_before_its_images_were_placed_is_said(tmp_path):
+    twin = openmvg(tmp_path / "scan")
+    (twin.path / "sfm_data_final.json").unlink()
+    frames, _, unit, notes = read_capture(twin.path)
+    assert unit is None and all(frame.E is None for frame in frames)
+    assert [note.code for note in notes] == ["capture.no-poses"]
+
+
+@pytest.mark.parametrize("side", [-1, -2, 0.5])
+def test_images_of_nearly_the_size_of_their_cameras_are_doubted(side, tmp_path):
+    """COLMAP's undistorter changes sizes by few pixels; smaller copies have half the sides."""
+    folder = splats(tmp_path / "scan").path
+    text = (folder / "cameras.json").read_text()
+    for name, pixels in zip(("width", "height"), SIZE, strict=True):
+        other = 2 * pixels if side == 0.5 else pixels - side
+        text = text.replace(f'"{name}": {pixels}', f'"{name}": {other}')
+    (folder / "cameras.json").write_text(text)
+    notes = Capture.open(folder).notes
+    assert [(note.code, note.forbids_trust) for note in notes] == [("capture.other-size", True)] * (
+        side == -2
+    )
+
+
+def test_what_a_failed_download_left_is_named_whatever_its_format(tmp_path):
+    (tmp_path / "model.nvm").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n")
+    with pytest.raises(InputError, match=r"Git LFS\. Fetch the file itself"):
+        read_capture(tmp_path / "model.nvm")
+
+
+def test_bundler_finds_its_list_where_its_script_keeps_it_or_asks_for_it(tmp_path):
+    twin = bundler(tmp_path / "scan")
+    (twin.path / "prepare").mkdir()
+    shutil.move(twin.path / "list.txt", twin.path / "prepare" / "list.txt")
+    assert len(opened(twin)) == 4
+    (twin.path / "prepare" / "list.txt").unlink()
+    with pytest.raises(InputError, match="with its list of images.*a name a line"):
+        opened(twin)

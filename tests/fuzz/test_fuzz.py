@@ -23,8 +23,8 @@ from geodiff_plugin.formats.captures import read_capture
 from geodiff_plugin.formats.images import warn_of_other_lens
 from geodiff_plugin.formats.out import check_out
 from geodiff_plugin.jobs.pairs import is_many
+from tests.contracts import captures, captures_of_fields, captures_of_sfm
 from tests.contracts.calibrations import SAMPLES, choice, written
-from tests.contracts.captures import WRITERS
 from tests.unit.test_capture_files import colmap_text, transforms
 
 COMMON: dict[str, Any] = {
@@ -151,6 +151,7 @@ E = np.eye(4)
 E[0, 3] = 0.12
 GOOD = {"right": RIGHT, "K": K, "E": E}
 IMAGES, POINT_FILES = image_bytes(), point_files()
+WRITERS = (*captures.WRITERS, *captures_of_fields.WRITERS, *captures_of_sfm.WRITERS)
 pytestmark = pytest.mark.parametrize(
     "size", [pytest.param(EXAMPLES, id="few"), pytest.param(MANY, id="many", marks=pytest.mark.slow)]
 )

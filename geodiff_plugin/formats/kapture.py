@@ -1,0 +1,91 @@
+"""Kapture's sensors, records and trajectories as a capture; the format has no unit.
+
+Source: ``kapture_format.adoc`` of naver/kapture: poses are world-to-device, camera models are COLMAP's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin._checks import InputError
+from geodiff_plugin.formats.colmap import model_camera
+from geodiff_plugin.formats.files import read_text
+from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout
+from geodiff_plugin.formats.rigs import Camera, array_of, pose_of
+
+#: A sensor whose model is not known: its K is typed, or by EXIF.
+UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
+
+
+def read_kapture(path: Path, images_at: Path | None = None) -> Layout | None:
+    """The images of ``sensors/records_camera.txt``, by their own pose or that of their rig."""
+    for folder in (path / "sensors", path):
+        files = [folder / f"{name}.txt" for name in ("sensors", "records_camera")]
+        if all(file.is_file() for file in files):
+            return _kapture(folder, images_at)
+    return None
+
+
+def _rows(file: Path) -> list[list[str]]:
+    """The fields of each line, which commas divide."""
+    lines = read_text(file, f"{file}").splitlines()
+    rows = [[field.strip() for field in line.split(",")] for line in lines]
+    return [row for row in rows if row != [""] and not row[0].startswith("#")]
+
+
+def _poses(file: Path) -> dict[tuple[str, str], np.ndarray]:
+    """Rigid transforms ``(4, 4)`` by the first two fields; those with a number left out are not known."""
+    if not file.is_file():
+        return {}
+    poses = {}
+    for first, second, *numbers in _rows(file):
+        if all(numbers[:7]) and len(numbers) >= 7:
+            qw, qx, qy, qz, *place = array_of(numbers[:7], (7,), f"{file.name}: a pose")
+            poses[first, second] = pose_of(Rotation.from_quat([qx, qy, qz, qw]), place)
+    return poses
+
+
+def _kapture(folder: Path, images_at: Path | None) -> Layout:
+    cameras: dict[str, Camera | str | None] = {}
+    for device, _, kind, *words in _rows(folder / "sensors.txt"):
+        if kind == "camera":
+            cameras[device] = _camera(device, words)
+    trajectories, rigs = _poses(folder / "trajectories.txt"), _poses(folder / "rigs.txt")
+    rig_of = {sensor: (rig, T_sensor_from_rig) for (rig, sensor), T_sensor_from_rig in rigs.items()}
+    records = _rows(folder / "records_camera.txt")
+
+    def build(frame: CaptureFrame, time: str, device: str) -> Candidate:
+        camera = cameras.get(device, f"sensor {device} is not in sensors.txt")
+        if isinstance(camera, str):
+            raise InputError(camera)
+        T_camera_from_world = trajectories.get((time, device))
+        if T_camera_from_world is None and device in rig_of:
+            rig, T_camera_from_rig = rig_of[device]
+            T_rig_from_world = trajectories.get((time, rig))
+            T_camera_from_world = None if T_rig_from_world is None else T_camera_from_rig @ T_rig_from_world
+        E = None if T_camera_from_world is None else np.linalg.inv(T_camera_from_world)
+        return Candidate(replace(frame, E=E), camera)
+
+    folders = [at for at in (folder / "records_data", folder) if at.is_dir()]
+    images = Images([name for _, _, name, *_ in records], folders, folder, images_at)
+    pairs = zip(images.names, records, strict=True)
+    candidates = [
+        images.candidate(name, partial(build, time=time, device=device)) for name, (time, device, *_) in pairs
+    ]
+    return Layout("kapture", None, candidates, notes=images.notes)
+
+
+def _camera(device: str, words: list[str]) -> Camera | str | None:
+    """The camera of ``model, w, h, parameters``; why it cannot be used; ``None`` where it is not known."""
+    model, width, height, *numbers = words
+    if model == UNKNOWN_CAMERA:
+        return None
+    try:
+        return model_camera(device, model, (int(float(width)), int(float(height))), " ".join(numbers))
+    except InputError as error:
+        return str(error)
