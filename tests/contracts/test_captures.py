@@ -79,9 +79,7 @@ def test_a_lost_image_leaves_out_its_frame_alone(write, tmp_path):
 def test_an_image_lost_from_what_is_matched_by_order_is_refused(write, tmp_path):
     twin = write(tmp_path / "scan")
     opened(twin).frames[1].image.unlink()
-    with pytest.raises(
-        InputError, match="of (the )?3 (lines|images)|there are images \\(3\\)|one for each image"
-    ):
+    with pytest.raises(InputError, match=r"of (the )?3 (lines|images)|images \(3\)|one for each"):
         opened(twin)
 
 
@@ -218,7 +216,7 @@ def test_two_frames_of_reference_in_one_file_of_metashape_are_not_mixed(tmp_path
     other = '<component id="1"><transform><scale>40</scale></transform></component>'
     (folder / "cameras.xml").write_text(alone.replace('active_id="0">', f'active_id="0">{other}'))
     capture = Capture.open(folder)
-    assert len(capture) == 3 and [note.code for note in capture.notes] == ["capture.part"]
+    assert len(capture) == 3 and "capture.part" in [note.code for note in capture.notes]
     for frame, E in zip(capture.frames, TRUE, strict=False):
         np.testing.assert_allclose(frame.E, E, atol=1e-6)
 
@@ -338,10 +336,8 @@ def test_images_of_nearly_the_size_of_their_cameras_are_doubted(side, tmp_path):
         other = 2 * pixels if side == 0.5 else pixels - side
         text = text.replace(f'"{name}": {pixels}', f'"{name}": {other}')
     (folder / "cameras.json").write_text(text)
-    notes = Capture.open(folder).notes
-    assert [(note.code, note.forbids_trust) for note in notes] == [("capture.other-size", True)] * (
-        side == -2
-    )
+    said = [(note.code, note.forbids_trust) for note in Capture.open(folder).notes]
+    assert said == [("capture.other-size", True)] * (side == -2)
 
 
 def test_what_a_failed_download_left_is_named_whatever_its_format(tmp_path):

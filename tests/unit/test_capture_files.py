@@ -608,3 +608,61 @@ def test_every_camera_model_of_colmap_is_straightened_as_pycolmap_says(model, tm
         assert np.abs(taken - pinhole).max() > 0.5
         np.testing.assert_allclose(undistorted_pixels(taken, frame.K, frame.lens), pinhole, atol=0.02)
         assert capture.image("f00").shape == (*SIZE[::-1], 3)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.002])
+def test_lengths_of_a_matrix_that_somebody_scaled_have_no_unit(factor, tmp_path):
+    folder = transforms(tmp_path / "scan")
+    data = json.loads((folder / "transforms.json").read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"] = (factor * np.array(frame["transform_matrix"])).tolist()
+    (folder / "transforms.json").write_text(json.dumps(data))
+    capture = Capture.open(folder)
+    assert capture.unit == ("m" if factor == 1.0 else None)
+    np.testing.assert_allclose(capture.frames[1].E, TRUE[1], atol=1e-6)
+
+
+def test_the_folder_of_models_alone_is_enough(tmp_path):
+    folder = colmap_text(tmp_path / "scan")
+    assert len(Capture.open(folder / "sparse")) == len(Capture.open(folder)) == 4
+
+
+def test_commas_may_divide_the_numbers_of_an_image_of_colmap(tmp_path):
+    """As kapture's export of rigs writes them."""
+    file = colmap_text(tmp_path / "scan") / "sparse" / "0" / "images.txt"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join(x.replace(" ", ", ") if x.endswith("png") else x for x in lines))
+    np.testing.assert_allclose(Capture.open(tmp_path / "scan").frames[2].E, TRUE[2], atol=1e-6)
+
+
+def test_a_heading_of_tum_may_lack_its_mark(tmp_path):
+    folder = tum(tmp_path / "scan")
+    for name, heading in (("rgb.txt", "timestamp filename"), ("groundtruth.txt", "timestamp tx ty tz qx qy")):
+        file = folder / name
+        file.write_text(f"{heading}\n{file.read_text()}")
+    np.testing.assert_allclose(Capture.open(folder).frames[2].E, TRUE[2], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("number", "centre", "bent"),
+    [("1", (318.6, 255.3), True), ("3", (320.1, 247.6), False), ("", (319.5, 239.5), False)],
+)
+def test_a_sequence_of_tum_is_of_the_camera_that_it_is_named_after(number, centre, bent, tmp_path):
+    folder = tum(tmp_path / "scan")
+    (folder / "K.txt").unlink()
+    for i in range(4):
+        save(folder / "rgb" / f"{i}.png", np.zeros((480, 640, 3), np.uint8))
+    head = f"# color images\n# file: 'rgbd_dataset_freiburg{number}_xyz.bag'\n" if number else ""
+    (folder / "rgb.txt").write_text(head + (folder / "rgb.txt").read_text())
+    capture = Capture.open(folder)
+    assert ("capture.assumed-k" in [note.code for note in capture.notes]) == (not number)
+    assert tuple(capture.frames[0].K[:2, 2]) == centre
+    assert (capture.frames[0].lens is not None) == bent
+
+
+def test_four_numbers_beside_a_sequence_are_its_camera(tmp_path):
+    """ETH3D's sequences are in TUM's layout, with fx, fy, cx and cy in calibration.txt."""
+    folder = tum(tmp_path / "scan")
+    (folder / "K.txt").unlink()
+    (folder / "calibration.txt").write_text(f"{K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]}\n")
+    np.testing.assert_allclose(Capture.open(folder).frames[0].K, K)
