@@ -108,7 +108,7 @@ MESSAGES: dict[str, MessageKind] = {
     "image.bits": MessageKind(
         "16-bit images of a bag are taken to be of fewer bits",
         cause="The camera has 10, 12 or 14 bits, and its driver stores the values as they come.",
-        cure="Nothing; of a camera of 16 bits the scene was dark.",
+        cure="Nothing. If the camera does have 16 bits, the scene was dark.",
     ),
     "image.alpha": MessageKind(
         "The alpha channel is dropped",
@@ -128,7 +128,7 @@ MESSAGES: dict[str, MessageKind] = {
     "camera.from-exif": MessageKind(
         "K comes from the EXIF of the photograph",
         cause="Neither K nor a field of view was given.",
-        cure="Nothing for a result that is good to a few per cent; calibrate the camera for more.",
+        cure="Nothing if a few per cent are exact enough; otherwise calibrate the camera.",
     ),
     "camera.filled-in": MessageKind(
         "Numbers of the camera are assumed",
@@ -276,7 +276,7 @@ MESSAGES: dict[str, MessageKind] = {
     "pose.kept": MessageKind(
         "The given pose is off by more than a pixel, and no pose near it is better",
         cause="K, the lens or the order of the views is wrong, or things moved between the photographs.",
-        cure="Check these in the order of the message.",
+        cure="Check these in the order in which the message names them.",
     ),
     "pose.too-far": MessageKind(
         "The pose that fits is too far from the given one and was not used",
@@ -451,7 +451,7 @@ MESSAGES: dict[str, MessageKind] = {
     ),
     "depth.order-points": MessageKind(
         "Prior and known depths disagree on near and far",
-        cause="The points are no metres along z in the left camera's frame, or the space of the prior is "
+        cause="The points are not metres along z in the left camera's frame, or the space of the prior is "
         "wrong.",
         cure="Check the frame and the unit of the points, and the space of the prior.",
         forbids_trust=True,
