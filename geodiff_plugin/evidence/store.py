@@ -46,8 +46,8 @@ class EvidenceStore:
         settings = (*(getattr(config, name) for name in knobs), config.search == "volume")
         settings = (*settings, needs_matches, measured_baseline, given.unit)
         for entry in self._entries:
-            as_many = entry.settings == settings and len(entry.tensors) == len(tensors)
-            if as_many and all(map(_equal, entry.tensors, tensors)):
+            comparable = entry.settings == settings and len(entry.tensors) == len(tensors)
+            if comparable and all(map(_equal, entry.tensors, tensors)):
                 self._spared += entry.seconds
                 return entry.evidence
         start = time.perf_counter()

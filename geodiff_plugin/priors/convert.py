@@ -368,6 +368,29 @@ def _read_prompt(file: Path, requested: str | None) -> Tensor:
     bad_value("--with", expected, requested or "none beside", f"Name it: --with .../{PROMPT_FOLDER}")
 
 
+def _merge_into_base(base: Path, file: Path, folder: Path) -> None:
+    """Write the networks of the base with the trained weights and factors of a file; checked before."""
+    state = load_file(file)
+    trained = {part: _trained(state, part) for part in FOLDERS}
+    sources = {}
+    for part, name in FOLDERS.items():
+        sources[name], tensors = _base_files(base, name)
+        known = trained[part]
+        factors = {f"{key[:-2]} {factor}" for key in known if " " in key for factor in "AB"}
+        missing = [f"{key[:-2]} of factor {key[-1]}" for key in factors - known.keys()]
+        check_weights(missing, {key.partition(" ")[0] for key in known} - tensors, str(file))
+    if not any(key.endswith(" A") for key in trained["Diffuser"]):
+        bad_value(str(file), "a checkpoint of Marigold V2 with a LoRA (Diffuser.*.lora_A.*)", "one without")
+    for part, name in FOLDERS.items():
+        (folder / name).mkdir(parents=True)
+        for copied in ("config.json", INDEX):
+            if (base / name / copied).is_file():
+                shutil.copyfile(base / name / copied, folder / name / copied)
+        for source in sources[name]:
+            whole = {key: merged(key, v, trained[part]) for key, v in load_file(source).items()}
+            _save_weights(whole, folder / name / source.name)
+
+
 def _convert_marigold_v2(
     base: Path, checkpoint: Path, folder: Path, prompts: str | None, space: str | None
 ) -> None:
@@ -376,30 +399,12 @@ def _convert_marigold_v2(
     if not os.path.isfile(file) or file.suffix != ".safetensors":
         expected = f"a folder of huawei-bayerlab/marigold-v2-0 with {TRAINABLES}, such as depth/Log-stage2"
         bad_value("CHECKPOINT", expected, checkpoint, "Check the path.")
-    prompt, name = _read_prompt(file, prompts), file.resolve().parent.name
-    space = space or SPACE_OF_CHECKPOINT.get(name.split("-")[0].lower())
+    prompt, trained_as = _read_prompt(file, prompts), file.resolve().parent.name
+    space = space or SPACE_OF_CHECKPOINT.get(trained_as.split("-")[0].lower())
     if space is None:
         cure = "Keep the authors' folder name, or say with --space what its map is affine in."
-        bad_value("CHECKPOINT", "in a folder called Log-*, Uniform-* or Disparity-*", repr(name), cure)
-    state = load_file(file)
-    trained = {part: _trained(state, part) for part in FOLDERS}
-    files = {}
-    for part, name in FOLDERS.items():
-        files[name], tensors = _base_files(base, name)
-        known = trained[part]
-        factors = {f"{key[:-2]} {factor}" for key in known if " " in key for factor in "AB"}
-        missing = [f"{key[:-2]} of factor {key[-1]}" for key in factors - known.keys()]
-        check_weights(missing, {key.partition(" ")[0] for key in known} - tensors, str(file))
-    if not any(name.endswith(" A") for name in trained["Diffuser"]):
-        bad_value(str(file), "a checkpoint of Marigold V2 with a LoRA (Diffuser.*.lora_A.*)", "one without")
-    for part, name in FOLDERS.items():
-        (folder / name).mkdir(parents=True)
-        for copied in ("config.json", INDEX):
-            if (base / name / copied).is_file():
-                shutil.copyfile(base / name / copied, folder / name / copied)
-        for source in files[name]:
-            whole = {key: merged(key, v, trained[part]) for key, v in load_file(source).items()}
-            _save_weights(whole, folder / name / source.name)
+        bad_value("CHECKPOINT", "in a folder called Log-*, Uniform-* or Disparity-*", repr(trained_as), cure)
+    _merge_into_base(base, file, folder)
     dtype = prompt.dtype if prompt.is_floating_point() else torch.float32
     _fixed_prompt(prompt).to(dtype).save_pretrained(folder / "prompt")
     FlowMatchEulerDiscreteScheduler().save_pretrained(folder / "scheduler")
