@@ -473,6 +473,13 @@ MESSAGES: dict[str, MessageKind] = {
         cause="The depth may lie beyond the range of the search.",
         cure="Check the unit of the baseline, or widen depth_range (--near, --far).",
     ),
+    "prior.order": MessageKind(
+        "The prior takes near for far, and the matches show that it is wrong",
+        cause="The prior does not know such scenes; or the given map is of another picture, turned, or of "
+        "another space.",
+        cure="Check the map and its space (--space). Otherwise nothing where things are matched; elsewhere "
+        "the depth follows the prior and has a low confidence.",
+    ),
     "prior.metres": MessageKind(
         "The depth is far from the prior's own metres",
         cause="The baseline is not in metres, K is of another image size, or the prior does not know such "

@@ -96,6 +96,7 @@ class PoseReport:
     distortion: float = math.nan  # radial coefficient k1 that both pictures still have for certain
     distortion_alone: float = math.nan  # what of it neither a turn nor a shear of the right picture explains
     tear: Tear | None = None  # where a picture is torn
+    exchangeable: float = math.nan  # share of the matches that fit as well with near and far exchanged
     warnings: tuple[Message, ...] = ()
 
 
@@ -177,6 +178,7 @@ class Indicators:
     distortion: float = math.nan  # k1 that both pictures still have for certain
     distortion_alone: float = math.nan  # what of it neither a turn nor a shear of the right picture explains
     tear: Tear | None = None  # where a picture is torn
+    exchangeable: float = math.nan  # share of the matches that fit as well with near and far exchanged
     shear: float = math.nan  # of the right picture from its first row to its last, in shares of its width
     off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
     doubts: tuple[Message, ...] = ()  # warnings about the input, each of which forbids trust

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.messages import Message
-from geodiff_plugin.pose.tracks import Tracks, epipolar
+from geodiff_plugin.pose.tracks import FEWEST, Tracks, epipolar
 
 INVERSE = Message(
     "pose.inverse",
@@ -167,3 +168,38 @@ def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> Message | N
     exactly = fit.median_px <= _AS_EXACT * nearby.median_px
     clear = (exactly or far) if coarsely else (finely and exactly and far)
     return mistake if clear else None
+
+
+def exchangeable(
+    tracks: Tracks, given: np.ndarray, near: np.ndarray, sizes: Sequence[tuple[int, int]]
+) -> float:
+    """Share of the matches that fit as well if near and far are exchanged, [0, 1]; NaN for too few.
+
+    Near and far are exchanged where the pictures were given in the wrong order, mirrored or upside down. Of
+    the matches that fit the poses ``near (V, 4, 4)``, it is the share that would fit these or the ``given``
+    ones once that is undone, for the worst of the three and for the view that excludes it best. Parallel
+    cameras see such matches behind infinity unless their principal points differ; others see them off their
+    epipolar lines. ``sizes`` are ``(H, W)`` of the left image and of the right ones that the tracks are of.
+    """
+    shares = []
+    for v, poses in enumerate(zip(given, near, strict=True)):
+        seen = tracks.view(v)
+        if len(seen) < FEWEST:
+            continue
+        undone = max(
+            _fit(each, T).shares[-1] for each in _exchanged(seen, sizes[0], sizes[v + 1]) for T in poses
+        )
+        as_it_is = _fit(seen, near[v]).shares[-1]
+        shares.append(min(1.0, undone / as_it_is) if as_it_is > 0 else 1.0)
+    return min(shares, default=math.nan)
+
+
+def _exchanged(tracks: Tracks, left: tuple[int, int], right: tuple[int, int]) -> Iterator[Tracks]:
+    """Tracks of one right view with the pictures exchanged, mirrored, and turned by 180 degrees."""
+    yield replace(tracks, left_px=tracks.right_px[0], right_px=tracks.left_px[None])
+    for turned in (np.array([True, False]), np.array([True, True])):
+        pixels = (
+            np.where(turned, np.array(size[::-1]) - 1.0 - px, px)
+            for size, px in ((left, tracks.left_px), (right, tracks.right_px))
+        )
+        yield replace(tracks, left_px=next(pixels), right_px=next(pixels))

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.pose.lens import remaining_distortion
-from geodiff_plugin.pose.mistakes import find_mistake, pose_change
+from geodiff_plugin.pose.mistakes import exchangeable, find_mistake, pose_change
 from geodiff_plugin.pose.solve import is_rig, nearby_poses, settle_poses
 from geodiff_plugin.pose.tearing import find_tear
 from geodiff_plugin.pose.tracks import (
@@ -131,6 +131,8 @@ def refine_views(posed: PosedViews, measured: bool = False) -> CheckedViews:
     heights = [image.shape[-2] for image in (posed.left_01, *(right.image_01 for right in rights))]
     tear = find_tear([grey for grey, _ in views], heights)
     report = _with_contradictions(replace(report, tear=tear), sparse, given)
+    sizes = [(grey.shape[0], grey.shape[1]) for grey, _ in views]
+    report = replace(report, exchangeable=exchangeable(sparse, given, near, sizes))
     if mistakes := _messages(sparse, find_mistake, given, near):
         return CheckedViews(rights, replace(report, status="mistaken", warnings=mistakes))
     if fits:

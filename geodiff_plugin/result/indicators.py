@@ -141,6 +141,7 @@ def indicators_of(
             known[name] = max((px for px in residuals if not math.isnan(px)), default=math.nan)
         known |= {"behind_infinity": pose.behind_infinity, "distortion": pose.distortion}
         known |= {"distortion_alone": pose.distortion_alone, "tear": pose.tear}
+        known["exchangeable"] = pose.exchangeable
         known["depth_spread"] = pose.depth_spread
         known["straightened_px"] = max(pose.straightened_px, default=0.0)
         if not math.isnan(pose.behind_px):  # a product would be another NaN, and verdicts would differ by it

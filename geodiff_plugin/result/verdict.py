@@ -21,8 +21,15 @@ OFF_MATCHES = math.log(1.2)
 LEAST_CONFIDENCE = 0.5
 #: The same for the share matched, which was .39 to .96 for right pairs.
 LEAST_MATCHED = 0.12
-#: The same for the rank correlation of near and far, which was +.18 to +.97 for right pairs.
+#: The same for the rank correlation of near and far, unless the matches exclude that these are exchanged: it
+#: was -.60 to +.97 for right pairs, as a prior may take a picture for another scene.
 MOST_EXCHANGED = -0.2
+#: A smaller share of matches that fit with near and far exchanged as well excludes that they are. It was up
+#: to .16 for right pairs whose pose fits, 1 with pictures exchanged, mirrored or upside down, and .99 for a
+#: right pair whose principal points differ by more than the matches are shifted.
+EXCHANGEABLE = 0.3
+#: A depth that differs from the matches by less follows them (median of the absolute log).
+ON_MATCHES = math.log(1.05)
 #: A lower rank correlation is bad unless ``MATCHED_ENOUGH`` is matched: a poor prior may cause it.
 LEAST_CORRELATION = 0.2
 #: Share matched from which the prior is rather to blame.
@@ -157,8 +164,23 @@ def _points_contradict(found: Indicators) -> bool:
     return not _points_differ_by_a_factor(found) and found.points_off > MANY_OFF
 
 
-def _exchanged(found: Indicators) -> bool:
+def _order_known(found: Indicators) -> bool:
+    """Whether the matches themselves show what is near, so that another order is the prior's mistake."""
+    excluded = found.exchangeable < EXCHANGEABLE and found.epipolar_px < WEAK_EPIPOLAR_PX
+    return excluded and _well_matched(found) and found.off_matches < ON_MATCHES
+
+
+def _order_contradicts(found: Indicators) -> bool:
+    """Whether the prior takes near for far, as the matches have it."""
     return found.rank_correlation < MOST_EXCHANGED and _depths_vary(found) and not _by_points_alone(found)
+
+
+def _exchanged(found: Indicators) -> bool:
+    return _order_contradicts(found) and not _order_known(found)
+
+
+def _prior_exchanged(found: Indicators) -> bool:
+    return _order_contradicts(found) and _order_known(found)
 
 
 def _hardly_ordered(found: Indicators) -> bool:
@@ -448,6 +470,16 @@ REMARKS = (
         lambda found: (
             f"K gives the left image a field of view of {found.view_deg:.0f} degrees: is it for an image of "
             "another size?"
+        ),
+    ),
+    Rule(
+        "prior.order",
+        _prior_exchanged,
+        lambda found: (
+            "The prior takes near for far (rank correlation with the matches "
+            f"{found.rank_correlation:+.2f}), and the matches show that it is wrong: is a map that was given "
+            "of this picture, and in the space that was named (--space)? Where nothing is matched the depth "
+            "follows the prior."
         ),
     ),
     Rule(

@@ -16,7 +16,7 @@ from geodiff_plugin.matching.planes import Parallax
 from geodiff_plugin.pose import refine
 from geodiff_plugin.pose import tracks as tracks_module
 from geodiff_plugin.pose.lens import remaining_distortion
-from geodiff_plugin.pose.mistakes import _candidates, find_mistake
+from geodiff_plugin.pose.mistakes import _candidates, exchangeable, find_mistake
 from geodiff_plugin.pose.refine import depths_apart, fit_displacement, refine_views, straightened
 from geodiff_plugin.pose.solve import PosePrior, is_rig, settle_poses, solve_poses
 from geodiff_plugin.pose.tracks import (
@@ -292,6 +292,29 @@ def test_a_principal_point_that_is_off_is_seen_in_pictures_of_far_things() -> No
         rights = (CameraView(rig.right.image_01.float(), K_right, T),)
         shares.append(refine_views(PosedViews(left, rights, K_left)).report.behind_infinity)
     assert shares[0] < 0.02 and shares[1] > 0.2
+
+
+@pytest.mark.parametrize(
+    ("E", "centre_off_px", "share"),
+    [(RIG, 0.0, 0.0), (TRUE, 0.0, 0.0), (RIG, 200.0, 1.0)],
+    ids=["rig", "posed", "rig of other centres"],
+)
+def test_the_matches_show_whether_near_and_far_could_be_exchanged(E, centre_off_px, share) -> None:
+    """A rig sees disparities of 19 to 75 px: with centres 200 px apart they are in front either way round."""
+    tracks, Ts, _ = make_tracks([E], count=1500, noise_px=0.2, outliers=0.02)
+    K_right = K.copy()
+    K_right[0, 2] += centre_off_px
+    tracks = replace(tracks, right_px=tracks.right_px + [centre_off_px, 0.0], K_rights=K_right[None])
+    width, height = (round(2 * c + 1) for c in K[:2, 2])
+    sizes = [(height, width), (height, width)]
+    assert exchangeable(tracks, Ts, Ts, sizes) == pytest.approx(share, abs=0.25)
+    mirrored_px = [width - 1.0, 0.0] + tracks.right_px * [-1.0, 1.0]
+    mistaken = (
+        replace(tracks, left_px=tracks.right_px[0], right_px=tracks.left_px[None]),
+        replace(tracks, left_px=[width - 1.0, 0.0] + tracks.left_px * [-1.0, 1.0], right_px=mirrored_px),
+    )
+    assert [exchangeable(each, Ts, Ts, sizes) for each in mistaken] == [1.0, 1.0]
+    assert np.isnan(exchangeable(tracks.kept(slice(39)), Ts, Ts, sizes))
 
 
 @pytest.mark.parametrize("k1", [-0.25, -0.1, 0.0, 0.2])

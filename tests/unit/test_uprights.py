@@ -57,6 +57,21 @@ def test_lines_that_lean_each_its_own_way_show_no_shear(seed):
     assert abs(certain_shear(grey, shift + own * ROWS[:, None], np.ones_like(shift))) < 0.03
 
 
+@pytest.mark.parametrize("others", [3, 4])
+def test_a_tilted_board_among_few_other_lines_is_no_shear(others):
+    """Its lines meet, and shifts grow along them; lines that lean otherwise hide where they meet."""
+    k, pole = 0.004, np.arange(WIDTH)
+    grows = 1 + k * (ROWS - HEIGHT / 2)[:, None]
+    board = (pole - WIDTH / 2) / grows
+    grey = np.where((np.abs(board) < 60) & (board % 12 < 5), 40, 120).astype(np.uint8)
+    shift = np.broadcast_to(30 * grows, grey.shape).astype(np.float32).copy()
+    for n in range(others):  # poles beside it that lean inwards, where the board's lines lean outwards
+        at = (1 - 2 * (n % 2)) * (-130 - 8 * (n // 2) + 0.18 * (ROWS - HEIGHT / 2)[:, None]) + WIDTH / 2
+        pole_here = np.abs(pole - at) < 2
+        grey[pole_here], shift[pole_here] = 10, 12.0
+    assert not abs(certain_shear(cv2.GaussianBlur(grey, (0, 0), 0.7), shift, np.ones_like(shift))) > 0.003
+
+
 def test_few_lines_and_few_matches_say_nothing():
     grey, shift = bars(0.0)
     everywhere = np.ones_like(shift)

@@ -13,6 +13,8 @@ GOOD = Indicators(
 )
 #: Without a second view: known depths alone.
 ALONE = Indicators(points=99, cover=0.5, rank_correlation=0.8)
+#: What excludes that near and far are exchanged, under a prior that says so.
+ORDERED = {"rank_correlation": -0.5, "exchangeable": 0.1, "epipolar_px": 0.3, "off_matches": 0.01}
 #: Codes of reasons and remarks, what is given beside, the indicator, and values without and with the message.
 TABLE = (
     ("depth.off-matches", {}, "off_matches", math.log(1.19), math.log(1.21)),
@@ -25,6 +27,13 @@ TABLE = (
     ("views.disagree", {"confidence": 0.52}, "epipolar_px", 0.95, 1.05),
     ("depth.exchanged", {}, "rank_correlation", -0.19, -0.21),
     ("depth.exchanged", {"rank_correlation": -0.5}, "spread", 0.149, 0.151),
+    ("depth.exchanged", ORDERED, "exchangeable", 0.29, 0.31),
+    ("depth.exchanged", ORDERED, "epipolar_px", 0.95, 1.05),
+    ("depth.exchanged", ORDERED, "matched", 0.51, 0.49),
+    ("depth.exchanged", ORDERED, "off_matches", math.log(1.04), math.log(1.06)),
+    ("prior.order", ORDERED, "rank_correlation", -0.19, -0.21),
+    ("prior.order", ORDERED, "exchangeable", 0.31, 0.29),
+    ("prior.order", ORDERED, "spread", 0.149, 0.151),
     ("depth.order", {"matched": 0.45}, "rank_correlation", 0.21, 0.19),
     ("depth.order", {"rank_correlation": 0.1}, "matched", 0.51, 0.49),
     ("depth.order", {"rank_correlation": 0.1, "matched": 0.45}, "spread", 0.149, 0.151),
