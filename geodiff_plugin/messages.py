@@ -203,6 +203,11 @@ MESSAGES: dict[str, MessageKind] = {
         "the file, as in translation_mm.",
         forbids_trust=True,
     ),
+    "calibration.as-taken": MessageKind(
+        "The pictures are taken to be as the cameras took them",
+        cause="The calibration describes pictures as taken and rectified ones, and matches fit the former.",
+        cure="Nothing; if the pictures are rectified, give a file of P1 and P2 alone.",
+    ),
     "calibration.doffs": MessageKind(
         "The right cx of a Middlebury file contradicts doffs",
         cause="cam1 is missing, or differs from cx0 + doffs, which the ground truth was made with.",

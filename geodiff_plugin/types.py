@@ -45,6 +45,7 @@ class Rig:
         unit: ``"m"``, or ``None`` where the source does not say what its lengths are in.
         measured: whether the distance between the cameras is calibrated or measured, so that a refined pose
             keeps it; ``False`` for poses of a tracker, of SLAM or of structure from motion.
+        as_taken: the cameras of the same pictures before they were rectified, where the source has both.
     """
 
     K_left: np.ndarray
@@ -57,6 +58,7 @@ class Rig:
     rectified: bool = False
     unit: str | None = "m"
     measured: bool = True
+    as_taken: Rig | None = None
 
     @property
     def T_right_from_left(self) -> np.ndarray:

@@ -6,6 +6,7 @@ Names are those of OpenCV's samples and of the programs that copy them; their un
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -13,14 +14,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._camera_checks import LONG_BASELINE_M
-from geodiff_plugin._checks import bad_value, warn
+from geodiff_plugin._checks import InputError, bad_value, warn
 from geodiff_plugin.formats.rigs import (
     Camera,
     CameraChoice,
     array_of,
+    in_units,
     intrinsics,
     make_rig,
     projected,
+    rectified_from,
     rigid,
     transform,
 )
@@ -42,6 +45,7 @@ CAMERA = "(?:cam(?:era)?)?"
 WORDS = {
     "M": "m|k|mtx|(?:cam|camera|k|new)?(?:mtx|mats?|matrix)|intr|intrinsics?(?:m(?:tx|at|atrix))?",
     "D": "d|(?:dis|dist|disto|distort|distortions?)(?:coe?f?fs?|coe?f?ficients?|vec|vector|param(?:eter)?s)?",
+    "R": "r|rrect|(?:rect|rectification)(?:rot|rotation|trans|transform|mats?|matrix)?",
     "P": "p|(?:proj|projection)(?:mats?|matrix)?",
 }
 #: Between which cameras a rotation or a translation is: left to right, as those of ``stereoCalibrate``.
@@ -84,7 +88,16 @@ def _names(first: int) -> dict[str, str]:
 NUMBERS = ("image_width", "image_height", "baseline")
 SIDES = ("image_width", "image_height")
 #: How many numbers others have: a rotation 9, or 3 of a rotation vector.
-COUNTS = {"P1": (12,), "P2": (12,), "R": (3, 9), "T": (3,), "R_back": (3, 9), "T_back": (3,)}
+COUNTS = {
+    "P1": (12,),
+    "P2": (12,),
+    "R1": (9,),
+    "R2": (9,),
+    "R": (3, 9),
+    "T": (3,),
+    "R_back": (3, 9),
+    "T_back": (3,),
+}
 #: Those that two parallel cameras may share, and those of which one may be many.
 FOR_BOTH = ("M", "D")
 #: A left camera of number 0.
@@ -189,6 +202,8 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     size = next((pair for pair in (named.get("image_size", sides), sides) if pair.size == 2), None)
     if named.keys() >= {"P1", "P2"}:
         rig = projected(named["P1"], named["P2"], size, size)
+        if named.keys() >= {"M1", "M2", "D1", "D2"}:
+            rig = _with_taken(rig, named, size)
     elif "baseline" in named and not named.keys() & {"R", "T", "T_back"} and not _is_posed(named):
         return _parallel(named, arrays, size)
     else:
@@ -197,6 +212,17 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         left, right = (Camera(_matrix(named[name], name), size, lens) for name, lens in lenses)
         rig = make_rig(left, right, _pose(named))
     return _with_unit(rig, {key: value for entries in read for key, value in entries.items()}, choice)
+
+
+def _with_taken(rig: Rig, named: Entries, size: Any) -> Rig:
+    """The rig of rectified pictures with the cameras that they were made from, where they can be read."""
+    with suppress(InputError):
+        left, right = (Camera(_matrix(named[f"M{n}"], "K"), size, named[f"D{n}"]) for n in (1, 2))
+        if named.keys() >= {"R", "T"}:
+            return replace(rig, as_taken=make_rig(left, right, _pose(named)))
+        if named.keys() >= {"R1", "R2"}:
+            return rectified_from(rig, left, right, (named["R1"], named["R2"]))
+    return rig
 
 
 def _is_posed(named: Entries) -> bool:
@@ -248,9 +274,7 @@ def _with_unit(rig: Rig, entries: Entries, choice: CameraChoice) -> Rig:
             f"distance of the cameras (--baseline, baseline_m)."
         )
         warn(Message("calibration.assumed-metres", sentence))
-    E = rig.E.copy()
-    E[:3, 3] /= units or 1.0
-    return replace(rig, E=E)
+    return in_units(rig, units or 1.0)
 
 
 def _parallel(named: Entries, arrays: Arrays, size: Any) -> Rig:

@@ -14,7 +14,7 @@ from geodiff_plugin._checks import UnknownFormatError, bad_type, bad_value, chec
 from geodiff_plugin.formats import colmap, devices, matlab, named, robotics, stereo, storage, transforms
 from geodiff_plugin.formats.files import PathLike
 from geodiff_plugin.formats.foreign import refuse_foreign_calibration
-from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, reading_whole
+from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, in_units, reading_whole
 from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Rig
 
@@ -162,9 +162,7 @@ def _in_metres(rig: Rig, baseline_m: float | None, by_image: bool) -> Rig:
     if length == 0:
         cure = "Both its cameras are at one place."
         bad_value("baseline_m", f"left out for {rig.source}", baseline_m, cure)
-    E = rig.E.copy()
-    E[:3, 3] *= baseline_m / length
-    return replace(rig, E=E)
+    return in_units(rig, length / baseline_m)
 
 
 def read_calibration(

@@ -320,6 +320,19 @@ def projected(P_left: Any, P_right: Any, size_left: Any = None, size_right: Any 
     return make_rig(cameras[0], cameras[1], E, rectified=True)
 
 
+def in_units(rig: Rig, units: float) -> Rig:
+    """The rig in metres, of one in a unit of which a metre has ``units``."""
+    E = rig.E.copy()
+    E[:3, 3] /= units
+    return replace(rig, E=E, as_taken=None if rig.as_taken is None else in_units(rig.as_taken, units))
+
+
+def rectified_from(rig: Rig, left: Camera, right: Camera, turns: tuple[Any, Any]) -> Rig:
+    """A rectified rig with the cameras that it was made from, by the rotations that rectified them."""
+    R_left, R_right = (transform(R, (0, 0, 0), "the rectifying rotation") for R in turns)
+    return replace(rig, as_taken=make_rig(left, right, np.linalg.inv(R_left) @ rig.E @ R_right))
+
+
 def rig_from_parameters(
     fx: float,
     fy: float,

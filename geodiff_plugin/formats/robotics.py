@@ -8,12 +8,13 @@ HKUST-Aerial-Robotics/VINS-Fusion.
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.formats.rigs import (
     Camera,
     CameraChoice,
@@ -22,8 +23,8 @@ from geodiff_plugin.formats.rigs import (
     make_rig,
     pose_of,
     projected,
+    rectified_from,
     rigid,
-    transform,
     two_cameras,
 )
 from geodiff_plugin.formats.storage import read_storage, read_yaml
@@ -157,11 +158,23 @@ def read_euroc(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     return make_rig(left, right, np.linalg.inv(T_body_left) @ T_body_right)
 
 
+#: Names of a matrix in a file of ``camera_calibration``, and in the message as ROS 1 and ROS 2 print it.
+ROS_NAMES = {
+    "P": ("projection_matrix", "P", "p"),
+    "K": ("camera_matrix", "K", "k"),
+    "D": ("distortion_coefficients", "D", "d"),
+    "R": ("rectification_matrix", "R", "r"),
+}
+
+
+def _of_ros(info: Entries, name: str) -> Any:
+    """The numbers of a matrix, or ``None``."""
+    matrix = next((info[key] for key in ROS_NAMES[name] if key in info), None)
+    return matrix.get("data") if isinstance(matrix, dict) else matrix
+
+
 def _projection(info: Entries) -> np.ndarray:
-    """``P`` of a file of ``camera_calibration``, or of the message as ROS 1 or ROS 2 prints it."""
-    matrix = next((info[name] for name in ("projection_matrix", "P", "p") if name in info), None)
-    data = matrix.get("data") if isinstance(matrix, dict) else matrix
-    return _of_window(info) @ array_of(data, (3, 4), "projection_matrix")
+    return _of_window(info) @ array_of(_of_ros(info, "P"), (3, 4), "projection_matrix")
 
 
 def _of_window(info: Entries) -> np.ndarray:
@@ -195,19 +208,26 @@ def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         expected = "-fx * baseline in the right camera's file"
         cure = "These are of single cameras. Calibrate the pair (camera_calibration with two topics)."
         bad_value("projection_matrix[0, 3]", expected, "the same in both", cure)
-    if all(info.get("rectified", True) for info in infos):
-        return rig
-    left, right = (transform(info["R"], (0, 0, 0), "R") for info in infos)
+    if not all(info.get("rectified", True) for info in infos):
+        return _taken_by_ros(rig, infos, sizes).as_taken or rig
+    with suppress(InputError, KeyError):  # a file of rectified images may leave out what they were
+        return _taken_by_ros(rig, infos, sizes)
+    return rig
+
+
+def _taken_by_ros(rig: Rig, infos: list[Entries], sizes: list[tuple[Any, Any]]) -> Rig:
+    """The rectified rig with the cameras as they stand."""
     cameras = [
         Camera(
-            _of_window(info) @ array_of(info["K"], (3, 3), "K"),
+            _of_window(info) @ array_of(_of_ros(info, "K"), (3, 3), "K"),
             size,
-            info["D"],
+            _of_ros(info, "D"),
             str(info["distortion_model"]),
         )
         for info, size in zip(infos, sizes, strict=True)
     ]
-    return make_rig(cameras[0], cameras[1], np.linalg.inv(left) @ rig.E @ right)
+    R_left, R_right = (_of_ros(info, "R") for info in infos)
+    return rectified_from(rig, cameras[0], cameras[1], (R_left, R_right))
 
 
 def _orb_camera(entries: Entries, name: str, kind: str) -> Camera:

@@ -40,6 +40,7 @@ from geodiff_plugin.formats.reading import is_as_stored
 from geodiff_plugin.formats.recordings import both_halves
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
 from geodiff_plugin.jobs.options import DepthOptions, unique_names
+from geodiff_plugin.jobs.taken import fitting_rig
 from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Distortion, Rig
 
@@ -97,7 +98,7 @@ def read_pair(
     if options.estimate_pose:
         cameras = _cameras_without_poses(options, sizes)
     else:
-        cameras = _cameras_with_poses(options, sizes, names, of_files=frames is None)
+        cameras = _cameras_with_poses(options, images, names, of_files=frames is None)
     lenses = lenses_of(options, cameras.rig)
     images = [pinhole(*each, config) for each in zip(images, cameras.Ks, lenses, strict=False)]
     known: dict[str, Any] = {"cropped": options.cropped}
@@ -130,10 +131,12 @@ def _cameras_without_poses(options: DepthOptions, sizes: Sequence[Size]) -> _Cam
 
 
 def _cameras_with_poses(
-    options: DepthOptions, sizes: Sequence[Size], names: tuple[str, str] | None, of_files: bool
+    options: DepthOptions, images: Sequence[np.ndarray], names: tuple[str, str] | None, of_files: bool
 ) -> _Cameras:
+    sizes = [(image.shape[1], image.shape[0]) for image in images]
     rig = read_rig(options, sizes[0], sizes[1] if len(sizes) > 1 else None, names)
     if of_files:
+        rig = rig if options.disparity is not None else fitting_rig(rig, images)
         for K, (name, path) in zip((rig.K_left, rig.K_right), options.photographs().items(), strict=False):
             warn_of_other_lens(path, K, name)
     further = [_read_view_K(path) for path in options.view_k] or [rig.K_left] * len(options.view)
