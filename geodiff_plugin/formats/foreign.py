@@ -26,6 +26,11 @@ ONE_CAMERA = "It is of one camera: give the stereo calibration, or K and E of th
 SAVE_NPZ = "In Python: np.savez('calib.npz', K1=K1, D1=D1, K2=K2, D2=D2, R=R, T=T) of its matrices."
 FOREIGN_CALIBRATIONS = (
     ForeignCalibration(
+        r"\A\s*(RadTan|Pinhole|EquiDistant|KannalaBrandt|FOV|ATAN)[ \t]+[-+.\d]",
+        "a camera.txt of DSO",
+        ONE_CAMERA,
+    ),
+    ForeignCalibration(
         r"\AMATLAB 5\.0 MAT-file|\A\x89HDF",
         "a .mat of MATLAB (or HDF5)",
         "In MATLAB: writelines(jsonencode(toStruct(stereoParams)), 'stereo.json').",
@@ -33,11 +38,6 @@ FOREIGN_CALIBRATIONS = (
     ForeignCalibration(r"\A\x80[\x02-\x05]", "pickled objects, which are never loaded", SAVE_NPZ),
     ForeignCalibration(r"\A\x93NUMPY", "a single array", f"Give it as --K or --E. {SAVE_NPZ}"),
     ForeignCalibration(r"\APIEH", "a .cam of MPI Sintel", f"Read it by its sintel_io.py. {ONE_CAMERA}"),
-    ForeignCalibration(
-        r"\A# oST version",
-        "an .ini of ROS' camera_calibration",
-        "Give left.yaml and right.yaml, which lie in the same calibrationdata.tar.gz.",
-    ),
     ForeignCalibration(
         r"^\s*(Camera-system parameters|Calibration results)\s*:?\s*$",
         "Kalibr's results as text",
@@ -69,7 +69,6 @@ FOREIGN_CALIBRATIONS = (
         "parameters of an rc_visard or of cvkit",
         "Give --fx --fy --cx --cy of its camera.A, and its t as --baseline.",
     ),
-    ForeignCalibration(r'"vehicle_SE3_camera_"', "a calibration of Argoverse", ONE_CAMERA),
     ForeignCalibration(r'\A\s*\{(?=[\s\S]*"intrinsic_matrix")', "a camera of Open3D", ONE_CAMERA),
 )
 

@@ -211,7 +211,7 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         lenses = zip(("M1", "M2"), _lenses(arrays, named), strict=True)
         left, right = (Camera(_matrix(named[name], name), size, lens) for name, lens in lenses)
         rig = make_rig(left, right, _pose(named))
-    return _with_unit(rig, {key: value for entries in read for key, value in entries.items()}, choice)
+    return in_stated_unit(rig, {key: value for entries in read for key, value in entries.items()}, choice)
 
 
 def _with_taken(rig: Rig, named: Entries, size: Any) -> Rig:
@@ -263,8 +263,11 @@ def _refuse_missing(named: Entries, arrays: Arrays) -> None:
     bad_value("the file", expected, f"no {', '.join(missing)}{others}", cure)
 
 
-def _with_unit(rig: Rig, entries: Entries, choice: CameraChoice) -> Rig:
-    """The rig in metres, with a warning where the file does not say its unit and metres are unlikely."""
+def in_stated_unit(rig: Rig, entries: Entries, choice: CameraChoice) -> Rig:
+    """The rig in metres by the unit that ``entries`` say; else it is taken to be in metres.
+
+    Where that is unlikely it warns.
+    """
     length = float(np.linalg.norm(rig.E[:3, 3]))
     units = _units_a_metre(entries, length)
     if units is None and choice.baseline_m is None and LONGEST_UNSTATED_M < length <= LONG_BASELINE_M:

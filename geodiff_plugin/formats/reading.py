@@ -11,7 +11,18 @@ from pathlib import Path
 import numpy as np
 
 from geodiff_plugin._checks import UnknownFormatError, bad_type, bad_value, check_number, warn
-from geodiff_plugin.formats import colmap, devices, matlab, named, robotics, stereo, storage, transforms
+from geodiff_plugin.formats import (
+    colmap,
+    devices,
+    matlab,
+    multicamera,
+    named,
+    robotics,
+    slam,
+    stereo,
+    storage,
+    transforms,
+)
 from geodiff_plugin.formats.files import PathLike
 from geodiff_plugin.formats.foreign import refuse_foreign_calibration
 from geodiff_plugin.formats.rigs import CalibrationFormat, CameraChoice, in_units, reading_whole
@@ -20,6 +31,8 @@ from geodiff_plugin.types import Rig
 
 _JSON = r"\A\s*[{\[]"
 _NUMBER = r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?"
+#: A line of four numbers.
+_ROW = rf"{_NUMBER}(?:[ \t]+{_NUMBER}){{3}}[ \t]*(?:\r?\n|\Z)"
 #: A line that begins with a name of a camera, its matrix or its place.
 _NAME_OF_CAMERA = (
     r"^[ \t]*(?:[\w.-]*(?i:cam|intrin|extrin|matrix|mtx|dist|stereo|rotation|translation|baseline|left|right)"
@@ -34,6 +47,10 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     # The number behind the colon keeps OpenCV's "P1: !!opencv-matrix" out.
     "kitti_projections": CalibrationFormat(
         "KITTI (P0: ...)", r"^\s*P[0-3]\s*:\s*[-+.\d]", stereo.read_kitti, uses_cameras=True),
+    "robotcar": CalibrationFormat(
+        "pair of Oxford RobotCar's models (fx fy cx cy, and a 4x4)",
+        rf"\A(?:\s*{_ROW}){{4}}\s*0(?:\.0*)?[ \t]+-?0(?:\.0*)?[ \t]+-?0(?:\.0*)?[ \t]+1(?:\.0*)?\s*\Z",
+        stereo.read_robotcar, (2,)),
     "spring": CalibrationFormat(
         "Spring's intrinsics.txt (fx fy cx cy a line)",
         rf"\A(?:\s*{_NUMBER}(?:[ \t]+{_NUMBER}){{3}}[ \t]*(?:\n|\Z))+\s*\Z", stereo.read_spring),
@@ -70,6 +87,30 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "matlab": CalibrationFormat(
         "MATLAB's stereoParams by jsonencode (CameraParameters1)",
         _JSON + r'(?=[\s\S]*"CameraParameters1")', matlab.read_matlab),
+    "argoverse": CalibrationFormat(
+        "Argoverse's calibration of its stereo pair (vehicle_SE3_camera_)",
+        _JSON + r'(?=[\s\S]*"vehicle_SE3_camera_")', stereo.read_argoverse),
+    "mrcal": CalibrationFormat(
+        "pair of mrcal's .cameramodel (lensmodel)", r"['\"]lensmodel['\"]\s*:", multicamera.read_mrcal, (2,)),
+    "anipose": CalibrationFormat(
+        "calibration.toml of anipose, Calib.toml of Pose2Sim (matrix, distortions)",
+        r"\A(?=[\s\S]*^distortions[ \t]*=)[\s\S]*^matrix[ \t]*=", multicamera.read_anipose,
+        uses_cameras=True),
+    "okvis": CalibrationFormat(
+        "settings of OKVIS (cameras, T_SC)", r"^[ \t]*-?[ \t]*\{?[ \t]*T_SC[ \t]*:", slam.read_okvis,
+        uses_cameras=True),
+    "svo": CalibrationFormat(
+        "rig of SVO or maplab (cameras, T_B_C)",
+        r"\A(?=[\s\S]*^cameras[ \t]*:)[\s\S]*^[ \t-]*T_(B_C|C_B)[ \t]*:", slam.read_svo, uses_cameras=True),
+    "stella": CalibrationFormat(
+        "settings of stella_vslam (Camera, focal_x_baseline)",
+        r"\A(?=[\s\S]*^[ \t]+(setup|focal_x_baseline)[ \t]*:)[\s\S]*^Camera[ \t]*:[ \t]*(#.*)?$",
+        slam.read_stella),
+    "airslam": CalibrationFormat(
+        "settings of AirSLAM (cam0, T_type)", r"^[ \t]+T_type[ \t]*:", slam.read_airslam),
+    "ros_ini": CalibrationFormat(
+        ".ini of ROS' camera_calibration ([image], camera matrix)", r"^camera matrix[ \t]*$",
+        robotics.read_ros_ini, (1, 2)),
     "vins": CalibrationFormat(
         "VINS-Fusion's configuration (cam0_calib, body_T_cam0)", r"^(cam0_calib|model_type)\s*:",
         robotics.read_vins, beside=robotics.vins_cameras),
@@ -105,7 +146,10 @@ def _texts(path: PathLike | Sequence[PathLike]) -> dict[Path, str]:
     if not isinstance(paths, (tuple, list)) or not all(isinstance(p, (str, os.PathLike)) for p in paths):
         bad_type("calibration", "a path, or a pair of paths (left, right)", path)
     if len(paths) == 1 and os.path.isdir(paths[0]):
-        paths = colmap.model_files(Path(paths[0])) or paths
+        folder = Path(paths[0])
+        if not (model := colmap.model_files(folder)) and (text := storage.text_of_arrays(folder)):
+            return {folder: text}
+        paths = model or paths
     for file in paths:
         refuse_foreign_calibration(Path(file))
     return {Path(file): _text(Path(file)) for file in paths}

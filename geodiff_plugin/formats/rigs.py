@@ -32,7 +32,9 @@ LENS_MODELS = {
     **{"": "opencv", "cameratype 0": "opencv", "cameratype 1": "fisheye"},
     **dict.fromkeys("opencv pinhole simple_pinhole none brownconrady".split(), "opencv"),
     **dict.fromkeys("full_opencv simple_radial radial perspective".split(), "opencv"),
-    **dict.fromkeys("radtan radial-tangential radial_tangential".split(), "opencv"),
+    **dict.fromkeys(
+        "radtan radial-tangential radial_tangential radialtangential radialtangential8".split(), "opencv"
+    ),
     **dict.fromkeys("plumb_bob rational_polynomial".split(), "opencv"),
     **dict.fromkeys("fisheye opencv_fisheye equidistant kannalabrandt4 kannalabrandt8".split(), "fisheye"),
     **dict.fromkeys("simple_fisheye simple_radial_fisheye radial_fisheye".split(), "fisheye"),

@@ -8,6 +8,7 @@ HKUST-Aerial-Robotics/VINS-Fusion.
 from __future__ import annotations
 
 import json
+import re
 from contextlib import suppress
 from typing import Any
 
@@ -201,7 +202,41 @@ def read_ros(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 
     Those that say ``rectified: false`` (``recordings.stereo_calibration``) stand for the images as taken.
     """
-    infos = [read_yaml(text) for text in texts]
+    return _rig_of_infos([read_yaml(text) for text in texts])
+
+
+#: Headings of a file of ``camera_calibration`` in its older form, and the entries of the newer one.
+INI_NAMES = {
+    "camera matrix": "camera_matrix",
+    "distortion": "distortion_coefficients",
+    "rectification": "rectification_matrix",
+    "projection": "projection_matrix",
+    "width": "image_width",
+    "height": "image_height",
+}
+
+
+def read_ros_ini(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """``left.ini`` and ``right.ini``, or both in one file, as ``camera_calibration`` prints them."""
+    blocks = [block for text in texts for block in re.split(r"(?m)^\[image\][ \t]*$", text)[1:]]
+    if len(blocks) != 2:
+        cure = "Give left.ini and right.ini, or the file that holds both, left one first."
+        bad_value("the file", "of two cameras, [image] before each", f"{len(blocks)} of them", cure)
+    return _rig_of_infos([_ini_entries(block) for block in blocks])
+
+
+def _ini_entries(block: str) -> Entries:
+    """The entries of a camera by their names in the newer form."""
+    entries: Entries = {"distortion_model": "plumb_bob"}
+    heading = r"(?m)^(" + "|".join(INI_NAMES) + r")[ \t]*\n((?:[ \t]*[-+.\deE \t]+\n?)+)"
+    for name, numbers in re.findall(heading, block):
+        words = numbers.split()
+        entries[INI_NAMES[name]] = words[0] if len(words) == 1 else {"data": words}
+    return entries
+
+
+def _rig_of_infos(infos: list[Entries]) -> Rig:
+    """The rectified images by ``P``, and the images as taken where the entries say so."""
     sizes = [_window_size(info) for info in infos]
     rig = projected(*map(_projection, infos), *sizes)
     if not rig.E[:3, 3].any():

@@ -122,6 +122,35 @@ def read_spring(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     return make_rig(camera, camera, SPRING_BASELINE_M, rectified=True)
 
 
+def read_robotcar(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """``models/stereo_wide_left.txt`` and ``_right.txt`` of Oxford RobotCar: of images without distortion.
+
+    The matrix is the pose of the image's axes in the frame of the stereo camera. Source:
+    ``python/camera_model.py`` of ori-mrg/robotcar-dataset-sdk.
+    """
+    rows = [array_of(text.split(), (-1,), "the model").reshape(-1, 4) for text in texts]
+    left, right = (Camera(intrinsics(*each[0])) for each in rows)
+    poses = [rigid(each[1:], "the pose of the model") for each in rows]
+    return make_rig(left, right, np.linalg.inv(poses[0]) @ poses[1], rectified=True)
+
+
+def read_argoverse(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """Argoverse's ``vehicle_calibration_stereo_info.json``: its rectified pair, by the poses in the vehicle.
+
+    Source: ``argoverse/utils/calibration.py`` of argoverse/argoverse-api.
+    """
+    cameras = {each["key"]: each["value"] for each in json.loads(texts[0])["camera_data_"]}
+    names = [f"image_raw_stereo_front_{side}" for side in ("left", "right")]
+    if not {f"{name}_rect" for name in names} <= cameras.keys():
+        cure = "Give vehicle_calibration_stereo_info.json of the stereo images."
+        bad_value("the file", "one of the rectified stereo pair", ", ".join(cameras), cure)
+    keys = ("focal_length_x_px_", "focal_length_y_px_", "focal_center_x_px_", "focal_center_y_px_")
+    left, right = (Camera(intrinsics(*(cameras[f"{name}_rect"][key] for key in keys))) for name in names)
+    shifts = [cameras[name]["vehicle_SE3_camera_"]["translation"] for name in names]
+    places = array_of(shifts, (2, 3), "the places of the cameras")
+    return make_rig(left, right, float(np.linalg.norm(places[0] - places[1])), rectified=True)
+
+
 def read_sceneflow(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """SceneFlow's ``camera_data.txt``: poses of both cameras a frame, camera-to-world in Blender's axes.
 

@@ -157,6 +157,21 @@ def _numbers(value: Any) -> np.ndarray | None:
         return None
 
 
+def text_of_arrays(folder: Path) -> str:
+    """The small arrays of a folder of ``.npy`` as JSON, for ``read_opencv``; empty where there are none.
+
+    StereoVision and StereoPi's tutorial keep a calibration so: ``cam_mats_left.npy`` and so on.
+    """
+    matrices: Entries = {}
+    for path in sorted(folder.glob("*.npy")):
+        if path.stat().st_size <= 8 * MOST_NUMBERS + NPY_HEAD:
+            with suppress(ValueError, OSError, EOFError):  # of objects, or damaged
+                value = np.load(path, allow_pickle=False)
+                if value.dtype.kind in "fiu" and value.size <= MOST_NUMBERS:
+                    matrices[path.stem] = value.tolist()
+    return json.dumps(matrices) if len(matrices) > 1 else ""
+
+
 def text_of_npz(path: Path) -> str:
     """The small arrays of an ``.npz`` as JSON, for ``read_opencv``; nothing is unpickled."""
     matrices: Entries = {}

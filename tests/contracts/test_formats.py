@@ -65,7 +65,7 @@ def test_a_rig_of_any_pose_is_read_as_it_was_written(tmp_path, write, drawn):
 @given(drawn=rigs(turned=False))
 def test_a_rectified_rig_is_read_as_it_was_written(tmp_path, write, drawn):
     rig = of.read_texts(tmp_path, *write(drawn), distorted=True, **choice(write.__name__))
-    without_size = (of.kitti_projections, of.booster, of.vkitti)
+    without_size = (of.kitti_projections, of.booster, of.vkitti, of.argoverse, of.robotcar)
     check(rig, drawn, None if write in without_size else drawn.size)
     assert rig.rectified == (write is not of.stereodemo) and rig.distortion == (None, None)
 
@@ -149,6 +149,15 @@ REFUSALS = [
     ("matlab", '"TranslationOfCamera2"', '"Shift"', "no 'TranslationOfCamera2'. Is it of another program"),
     ("cityscapes", '"baseline"', '"base"', "got no 'baseline'. Is it of another program"),
     ("named", '"camera_matrix_left"', '"left_lens"', "P1, P2, or with M1, M2, R, T; got no M1"),
+    ("okvis", "radialtangential", "fov", "lens model of the left camera .* got fov"),
+    ("svo", "type: pinhole", "type: atan", "lens model of the left camera .* got atan"),
+    ("stella", "model: perspective", "model: fisheye", "got of setup stereo and model fisheye"),
+    ("airslam", "distortion_type: 1", "distortion_type: 7", "distortion_type must be one of 0, 1, 2; got 7"),
+    ("anipose", "[metadata]", "[third]\nmatrix = []\n[metadata]", r"of 0 \(cam0\), 1 \(cam1\), 2 \(third"),
+    ("mrcal", "OPENCV4", "SPLINED_STEREOGRAPHIC_order=3", "must be one of .*mrcal-convert-lensmodel"),
+    ("mrcal", "[ ", "[ __import__('os'), ", "a camera model of mrcal; got another text"),
+    ("argoverse", "_rect", "_raw", "rectified stereo pair; got image_raw_stereo_front_left"),
+    ("ros_ini", "projection\n", "projections\n", "projection_matrix must be 12 finite numbers; got None"),
     ("nerf", '"k1"', '"k4": 0.1, "k1"', "k4 must be zero for OPENCV; got .0.1."),
 ]  # fmt: skip
 
@@ -265,7 +274,8 @@ def test_sockets_of_an_oak_may_have_names(tmp_path):
         (b"\x80\x04\x95" + bytes(20), "never loaded. In Python: np.savez"),
         (b"\x93NUMPY\x01\0" + bytes(90), "Give it as --K or --E"),
         (b"PIEH" + bytes(90), "MPI Sintel"),
-        (b"# oST version 5.0 parameters\n\n[image]\n", "Give left.yaml and right.yaml"),
+        (b"# oST version 5.0 parameters\n\n[image]\ncamera matrix\n", "Give left.ini and right.ini"),
+        (b"RadTan 0.61 0.95 0.49 0.52 -0.28 0.07 0 0\n752 480\ncrop\n752 480\n", "camera.txt of DSO"),
         (b"Calibration results\n===\nCamera-system parameters:\n cam0\n", "Give the camchain.yaml"),
         (b'<?xml version="1.0"?>\n<calibration>\n  <projection>frame</projection>\n', "of one camera"),
         (b"%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 752\n", "names both cameras"),
@@ -273,7 +283,7 @@ def test_sockets_of_an_oak_may_have_names(tmp_path):
         (b"# Bundle file v0.3\n2 0\n", "geodiff capture"),
         (b'<?xml version="1.0"?>\n<document version="2.0.0">\n<chunk label="1">', "geodiff capture"),
         (b'[{"cameras": {}, "shots": {}}]', "geodiff capture"),
-        (b'{"camera_data_": [{"value": {"vehicle_SE3_camera_": {}}}]}', "Argoverse"),
+        (b'{"camera_data_": [{"key": "ring", "value": {"vehicle_SE3_camera_": {}}}]}', "stereo_info.json"),
         (b'{"intrinsic_matrix": [1, 0, 0, 0, 1, 0, 5, 5, 1], "width": 9}', "Open3D"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
         (b"<!DOCTYPE html>\n<html><body>404</body></html>\n", "a web page.*fetch it again"),

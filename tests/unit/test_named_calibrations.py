@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import InputError, noted
 from geodiff_plugin.formats import read_calibration
-from tests.contracts.calibrations import read_texts
+from tests.contracts.calibrations import SAMPLES, read_texts
 
 LEFT = [[811.0, 0, 402.5], [0, 809.0, 301.25], [0, 0, 1]]
 RIGHT = [[807.0, 0, 395.5], [0, 806.0, 298.75], [0, 0, 1]]
@@ -204,3 +204,54 @@ def test_archives_with_names_of_stereo_tutorials(tmp_path):
     }
     np.savez(tmp_path / "stereo.npz", **{name: np.array(value) for name, value in arrays.items()})
     is_the_rig(read_calibration(tmp_path / "stereo.npz", distorted=True))
+
+
+def test_a_folder_of_arrays_is_a_calibration(tmp_path):
+    """As StereoVision and StereoPi's tutorial keep one."""
+    folder = tmp_path / "calib_result"
+    folder.mkdir()
+    arrays = {
+        "cam_mats_left": LEFT,
+        "cam_mats_right": RIGHT,
+        "rot_mat": R,
+        "trans_vec": np.reshape(SHIFT_M, (3, 1)),
+    }
+    arrays |= {"dist_coefs_left": [LENS], "dist_coefs_right": [LENS], "e_mat": np.eye(3)}
+    for name, values in arrays.items():
+        np.save(folder / f"{name}.npy", np.array(values))
+    np.save(folder / "pickled.npy", np.array([{}], dtype=object), allow_pickle=True)
+    np.save(folder / "left_map.npy", np.zeros((480, 640), np.float32))
+    is_the_rig(read_calibration(folder, distorted=True))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="the folder .*empty. Name the file inside it"):
+        read_calibration(tmp_path / "empty")
+
+
+def test_both_cameras_of_ros_may_lie_in_one_file(tmp_path):
+    left, right = SAMPLES["ros_ini"]
+    rig = read_texts(tmp_path, left + right)
+    np.testing.assert_allclose(rig.E[:3, 3], [0.12, 0, 0], atol=1e-12)
+    with pytest.raises(InputError, match="Give left.ini and right.ini"):
+        read_texts(tmp_path, left)
+
+
+def test_cameras_of_many_are_chosen_by_their_numbers(tmp_path):
+    text = SAMPLES["anipose"][0]
+    third = text.partition("[cam_1]")[0].replace("[cam_0]", "[cam_2]")
+    text = text.replace("[metadata]", third + "[metadata]")
+    np.testing.assert_allclose(read_texts(tmp_path, text, cameras=(0, 1)).E[0, 3], 0.12)
+    np.testing.assert_allclose(read_texts(tmp_path, text, cameras=(1, 2)).E[0, 3], -0.12)
+
+
+def test_a_rectifier_of_stella_describes_pictures_as_taken_too(tmp_path):
+    content = yaml.safe_load(SAMPLES["stella"][0])
+    made = {"K_left": LEFT, "K_right": RIGHT, "D_left": LENS, "D_right": LENS}
+    made |= {"R_left": np.eye(3).ravel().tolist(), "R_right": TURN.as_matrix().ravel().tolist()}
+    rig = read_texts(tmp_path, yaml.safe_dump(content | {"StereoRectifier": made}))
+    assert rig.rectified and rig.E[0, 3] == pytest.approx(0.12)
+    expected = rig.E.copy()
+    expected[:3, :3] = TURN.as_matrix()
+    np.testing.assert_allclose(rig.as_taken.E, expected, atol=1e-9)
+    fisheye = made | {"model": "fisheye", "D_left": LENS[:4], "D_right": LENS[:4]}
+    taken = read_texts(tmp_path, yaml.safe_dump(content | {"StereoRectifier": fisheye})).as_taken
+    assert [lens.model for lens in taken.distortion] == ["fisheye", "fisheye"]

@@ -1,4 +1,4 @@
-"""Pictures as taken or rectified, where a calibration describes both: what the files say, what pictures fit."""
+"""Pictures as taken or rectified, where a calibration describes both."""
 
 import json
 
