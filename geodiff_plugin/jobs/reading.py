@@ -263,7 +263,7 @@ def _intrinsics(
     """
     if i > 1 and options.view_k:
         return _read_view_K(options.view_k[i - 2]), ()
-    if i > 0 and options.k_right is not None:
+    if i == 1 and options.k_right is not None:
         return _read_K(options.k_right, "--K-right"), ()
     if options.k is not None:
         return _read_K(options.k, "--K"), ()

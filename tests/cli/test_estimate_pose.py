@@ -1,6 +1,7 @@
 """``geodiff depth --estimate-pose`` on a pair as from a phone; what goes through a lens on its way there."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ from geodiff_plugin._checks import InputError
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats.lenses import distortion_from_text
 from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.jobs.reading import lenses_of, read_pair
+from geodiff_plugin.jobs.reading import _cameras_without_poses, lenses_of, read_pair
 from geodiff_plugin.types import Rig
 from tests.cli.conftest import report_of
 from tests.scenes import render_pair
@@ -125,6 +126,24 @@ def test_every_photograph_has_its_lens():
     ):
         with pytest.raises(InputError, match=error):
             told(own=own, **given)
+
+
+def test_every_photograph_has_its_k(tmp_path):
+    """Those of ``--K``, ``--K-right`` and, in order, ``--view-K``; without the latter two the left one's."""
+    files = [tmp_path / f"{focal}.txt" for focal in (100, 110, 120, 130)]
+    for path in files:
+        np.savetxt(path, [[float(path.stem), 0, 31.5], [0, float(path.stem), 23.5], [0, 0, 1]])
+    of_left, of_right, *further = files
+    options = DepthOptions(**VIEWS, view=(Path("v.png"), Path("w.png")), estimate_pose=True, k=of_left)
+    sizes = [(64, 48)] * 4
+    for given, focals in (
+        ({}, [100, 100, 100, 100]),
+        ({"k_right": of_right}, [100, 110, 100, 100]),
+        ({"k_right": of_right, "view_k": tuple(further)}, [100, 110, 120, 130]),
+        ({"view_k": tuple(further)}, [100, 100, 120, 130]),
+    ):
+        found = _cameras_without_poses(replace(options, **given), sizes).Ks
+        assert [K[0, 0] for K in found] == focals, given
 
 
 def test_the_estimation_of_poses_is_told_what_it_needs(pair_files, monkeypatch):

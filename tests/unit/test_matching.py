@@ -102,7 +102,7 @@ def test_what_a_right_camera_sees_of_planes_that_reach_behind_it(turn, at):
     """By projection: with a camera half a metre ahead, planes nearer than that are not seen."""
     left, (image, K_right, T), K, _, _ = scene(turn, at)
     grey = PosedViews(left.mean(0)[None], (CameraView(image.mean(0)[None], K_right, T),), K)
-    volume = m.sweep_planes(grey, torch.linspace(0.0, 3.0, 31))
+    volume = m.sweep_planes(grey, torch.linspace(0.0, 8.0, 33))
     rows, columns = torch.meshgrid(*(torch.arange(n).double() for n in SIZE), indexing="ij")
     rays = torch.stack([columns, rows, torch.ones_like(rows)], -1) @ torch.linalg.inv(K.double()).T
     at_infinity, camera = rays @ (K_right @ T[:3, :3]).double().T, (K_right @ T[:3, 3]).double()
@@ -110,7 +110,7 @@ def test_what_a_right_camera_sees_of_planes_that_reach_behind_it(turn, at):
         u, v, z = (at_infinity + w * camera).unbind(-1)
         inside = (u >= 0) & (u <= z * (SIZE[1] - 1)) & (v >= 0) & (v <= z * (SIZE[0] - 1)) & (z > 0.02)
         assert (seen != inside).float().mean() < 0.03, w
-    assert volume.in_view[:15].any() and volume.in_view[-1].any() == (at[2] < 0)
+    assert volume.in_view[:6].any() and volume.in_view[-1].any() == (at[2] < 0)
 
 
 @pytest.mark.parametrize(("turn", "at"), [*POSES[:3], (0.0, (-0.3, 0.0, 0.0))])

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from geodiff_plugin import InputError
 from geodiff_plugin.capture.frames import Capture
+from geodiff_plugin.formats.image_files import find_images, is_any_there
 from geodiff_plugin.formats.transforms import transforms_of
 from tests.contracts.captures import bundler, metashape, nvm, opensfm
 from tests.unit.test_capture_files import TRUE, colmap_binary, colmap_text, transforms
@@ -143,3 +145,14 @@ def test_a_folder_of_images_is_refused_where_no_file_names_them(tmp_path):
     folder = colmap_text(tmp_path / "scan")
     with pytest.raises(InputError, match=r"left out where no file names the images.*for images"):
         Capture.open(folder / "images", fov=60.0, images=folder / "images")
+
+
+def test_a_file_belongs_to_the_name_that_says_its_whole_path(tmp_path):
+    """Of the other camera's picture of the same moment, which is lost, only the name is left."""
+    (tmp_path / "left").mkdir()
+    Image.new("RGB", (4, 3)).save(tmp_path / "left/1.png")
+    folders, names = [tmp_path, tmp_path / "left"], ["left/1.png", "right/1.png"]
+    assert find_images(names, folders) == [tmp_path / "left/1.png", None]
+    assert find_images(names[::-1], folders) == [None, tmp_path / "left/1.png"]
+    assert find_images(["a/1.png", "b/1.png"], folders) == [None, None]  # either could mean it
+    assert is_any_there(["a/1.png", "b/1.png"], folders)

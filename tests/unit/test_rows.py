@@ -90,6 +90,15 @@ def test_columns_of_a_result_decode_to_its_maps(guided):
     assert row["verdict"] == output.verdict.status
 
 
+def test_depth_out_of_reach_is_unknown_in_its_column(guided):
+    """As of a sky, whose confidence is 0."""
+    confidence = np.array(guided.run.output.confidence)
+    confidence[..., :9, 20:30] = 0.0
+    run = replace(guided.run, output=replace(guided.run.output, confidence=confidence))
+    depth = np.asarray(Image.open(io.BytesIO(result_columns(GuidedPair(run, {}))["depth_mm"])))
+    np.testing.assert_array_equal(depth > 0, single_map(confidence) > 0)
+
+
 def test_a_run_of_other_options_is_told_in_the_words_of_the_command():
     made = replace(BASE, out=Path("a")).as_json()
     assert changed_options(replace(BASE, out=Path("b"), engine="ray", workers=3), made) == []
