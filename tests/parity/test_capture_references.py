@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import Capture
-from geodiff_plugin.capture.agreement import seen_in
+from geodiff_plugin.capture.agreement import agreed, rendered, seen_in
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.formats.depth import disparity_of_depth
 from geodiff_plugin.formats.transforms import nerf_pose
@@ -27,6 +27,9 @@ from geodiff_plugin.result.voting import _enlarged
 from geodiff_plugin.types import CameraView, DepthFrame, MetricDepthOutput, PosedViews
 
 K = np.array([[400.0, 0.0, 159.5], [0.0, 410.0, 119.5], [0.0, 0.0, 1.0]])
+
+#: Of frames of some ten pixels.
+K_SMALL = np.array([[10.0, 0.0, 3.0], [0.0, 10.0, 2.0], [0.0, 0.0, 1.0]])
 
 
 def poses(count: int) -> np.ndarray:
@@ -99,10 +102,9 @@ def test_everything_of_a_capture_is_rescaled_together(tmp_path):
 def test_a_point_is_in_a_picture_up_to_the_outer_edges_of_its_pixels(axis, shift, lost):
     """Another camera at the same place, whose principal point lies part of a pixel further on."""
     depth, E = np.full((5, 7), 2.0), poses(3)[1]
-    small = np.array([[10.0, 0.0, 3.0], [0.0, 10.0, 2.0], [0.0, 0.0, 1.0]])
-    moved = small.copy()
+    moved = K_SMALL.copy()
     moved[axis, 2] += shift
-    frame, other = (DepthFrame("", depth, np.ones_like(depth), each, E) for each in (small, moved))
+    frame, other = (DepthFrame("", depth, np.ones_like(depth), each, E) for each in (K_SMALL, moved))
     expected = np.ones(depth.shape, bool)
     if lost is not None:
         expected[(slice(None), lost) if axis == 0 else lost] = False
@@ -112,6 +114,67 @@ def test_a_point_is_in_a_picture_up_to_the_outer_edges_of_its_pixels(axis, shift
         nearest = np.rint(at + (shift if axis == along else 0.0))
         np.testing.assert_array_equal(found[expected], nearest[expected])
     np.testing.assert_allclose(seen.z, 2.0)
+
+
+def _agreed(depth: float, sure: float, others: list[tuple[float, float]], moving: bool) -> tuple:
+    """Depth, confidence, confirming and observing frames of a pixel, with its depth in other frames."""
+    near = [d / depth for d, _ in others]
+    confirming = [(d, c) for (d, c), ratio in zip(others, near, strict=True) if abs(ratio - 1) < 0.06]
+    observers = sum(ratio > 0.94 for ratio in near)
+    own = 2.0 * (0.05 + sure)
+    weights = [own, *(0.05 + c for _, c in confirming)]
+    inverse = sum(w / d for w, d in zip(weights, (depth, *(d for d, _ in confirming)), strict=True))
+    inverse, missing = inverse / sum(weights), (1 - sure) * math.prod(1 - 0.4 * c for _, c in confirming)
+    confirmed = len(confirming)
+    if not confirmed and not (moving and sure >= 0.8):
+        observers += sum(0 < ratio < 0.94 for ratio in near)
+        groups = [[(e, c) for e, c in others if e > 0 and abs(d / e - 1) < 0.06] for d, _ in others if d > 0]
+        best = max(groups, key=lambda group: sum(0.05 + c for _, c in group), default=[])
+        said = sum(0.05 + c for _, c in best)
+        if len(others) >= 2 and len(best) >= 2 and said > own:
+            inverse = sum((0.05 + c) / d for d, c in best) / said
+            missing, confirmed = math.prod(1 - 0.4 * c for _, c in best), len(best)
+    return 1.0 / inverse, 1.0 - missing, confirmed, max(observers, confirmed)
+
+
+@pytest.mark.parametrize(
+    ("sure", "others", "moving"),
+    [
+        (0.5, [], False),
+        (0.5, [(2.1, 0.7), (1.9, 0.2), (3.0, 0.9)], False),  # two confirm it, one sees something behind
+        (0.5, [(1.5, 0.9), (2.05, 0.4)], False),  # one sees a surface before it
+        (0.3, [(1.5, 0.9)], False),  # nobody outvotes it alone
+        (0.3, [(1.5, 0.9), (1.45, 0.6), (3.0, 0.9)], False),  # two do together
+        (0.3, [(1.5, 0.2), (1.45, 0.2), (3.0, 0.9)], False),  # but not with less weight
+        (0.9, [(1.5, 0.9), (1.45, 0.95), (1.5, 0.8)], True),  # nor what may have moved, if it is sure
+        (0.7, [(1.5, 0.9), (1.45, 0.95), (1.5, 0.8)], True),
+        (0.3, [(0.0, 0.9), (0.0, 0.9), (1.5, 0.4)], False),  # without a depth they say nothing
+    ],
+)
+def test_a_depth_and_that_of_other_frames_agree_as_written(sure, others, moving):
+    """Frames of one camera, each of one depth; a pixel is worked out by hand."""
+
+    def frame(depth: float, confidence: float) -> DepthFrame:
+        full = np.full((7, 9), depth)
+        return DepthFrame("", full, np.full_like(full, confidence), K_SMALL, poses(3)[1])
+
+    found = agreed(frame(2.0, sure), [frame(*each) for each in others], moving)
+    expected = _agreed(2.0, sure, others, moving)
+    for values, each in zip(
+        (found.depth, found.confidence, found.confirmed, found.observers), expected, strict=True
+    ):
+        np.testing.assert_allclose(values, each, rtol=1e-5)
+
+
+def test_of_several_points_of_a_finer_frame_a_pixel_shows_the_nearest():
+    """Nine of them; one in three is nearer, and comes before the others."""
+    finer = np.diag([3.0, 3.0, 1.0]) @ K_SMALL
+    depth = np.full((21, 27), 3.0)
+    depth[:, 2::3] = 2.0
+    other = DepthFrame("", depth, np.ones_like(depth), finer, np.eye(4))
+    frame = DepthFrame("", np.full((7, 9), 5.0), np.ones((7, 9)), K_SMALL, np.eye(4))
+    seen, values = rendered(other, frame, np.where(depth < 2.5, 7, 1))
+    assert (seen[:, 1:] == 2.0).all() and (values[:, 1:] == 7).all()
 
 
 def test_points_that_three_frames_see_are_known_depths_of_each_in_its_camera(tmp_path):

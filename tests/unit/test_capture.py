@@ -23,6 +23,7 @@ from geodiff_plugin.evaluation.baselines import PriorCache
 from geodiff_plugin.evaluation.captures import f_score
 from geodiff_plugin.evaluation.options import COMMANDS, CaptureEvalOptions
 from geodiff_plugin.jobs import capture as run
+from geodiff_plugin.jobs.journal import Item
 from geodiff_plugin.jobs.lengths import Span, measure, spans_to_measure
 from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.messages import Message, as_records
@@ -411,6 +412,17 @@ def test_shards_start_from_poses_that_were_solved_once_and_the_whole_joins_them(
     report = run.depth_capture(options)
     assert [frame["frame"] for frame in report["frames"]] == ["f02", "f04", "f06"] and len(written) == 3
     assert report["files"]["cloud_points"] > 0
+
+
+def test_a_folder_holds_a_frame_only_if_its_report_says_that_it_was_made_from_the_same(tmp_path):
+    """Poses, settings and pictures have one fingerprint, which is that of the item and of the report."""
+    item, other = (Item("f01", inputs=inputs) for inputs in ("a" * 20, "b" * 20))
+    for name in ("depth_alone", "confidence_alone"):
+        assert not run._is_made(item, tmp_path)
+        np.save(tmp_path / f"{name}.npy", np.ones((2, 2)))
+    assert not run._is_made(item, tmp_path)  # it ended before the report
+    (tmp_path / "report.json").write_text(json.dumps({"frame": "f01", "made_from": item.inputs}))
+    assert run._is_made(item, tmp_path) and not run._is_made(other, tmp_path)
 
 
 def test_a_tape_measures_between_two_pixels_of_a_frame(model, tmp_path, capsys):

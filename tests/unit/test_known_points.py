@@ -53,6 +53,12 @@ def test_points_may_have_an_intensity_or_a_colour_behind_them(columns):
     np.testing.assert_array_equal(as_points(rows, "points").numpy(), POINTS)
 
 
+@pytest.mark.parametrize("unknown", [0.0, np.nan, -1.0])
+def test_a_map_of_which_nothing_is_known_is_refused(unknown):
+    with pytest.raises(InputError, match="at least one of them known; got none: all are 0"):
+        as_points(np.full((6, 8), unknown, np.float32), "points")
+
+
 PLY = "ply\nformat {kind} 1.0\ncomment by hand\nelement vertex 2\n{properties}{more}end_header\n"
 PROPERTIES = "property double x\nproperty uchar red\nproperty float y\nproperty float z\n"
 
