@@ -13,7 +13,7 @@ from geodiff_plugin._checks import InputError
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats.lenses import distortion_from_text
 from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.jobs.reading import _cameras_without_poses, lenses_of, read_pair
+from geodiff_plugin.jobs.reading import _cameras_with_poses, _cameras_without_poses, lenses_of, read_pair
 from geodiff_plugin.types import Rig
 from tests.cli.conftest import report_of
 from tests.scenes import render_pair
@@ -144,6 +144,20 @@ def test_every_photograph_has_its_k(tmp_path):
     ):
         found = _cameras_without_poses(replace(options, **given), sizes).Ks
         assert [K[0, 0] for K in found] == focals, given
+
+
+def test_a_further_posed_view_has_the_left_ones_k_unless_it_is_given(tmp_path):
+    for focal in (100, 110, 120):
+        np.savetxt(tmp_path / f"{focal}.txt", [[focal, 0, 31.5], [0, focal, 23.5], [0, 0, 1]])
+    E = np.eye(4)
+    E[0, 3] = 0.1
+    np.savetxt(tmp_path / "E.txt", E)
+    poses = {"e": tmp_path / "E.txt", "view": (Path("v.png"),), "view_e": (tmp_path / "E.txt",)}
+    Ks = {"k": tmp_path / "100.txt", "k_right": tmp_path / "110.txt"}
+    options = DepthOptions(**VIEWS, **poses, **Ks)
+    for given, focals in (({}, [100, 110, 100]), ({"view_k": (tmp_path / "120.txt",)}, [100, 110, 120])):
+        found = _cameras_with_poses(replace(options, **given), [(64, 48)] * 3, None, of_files=False)
+        assert [K[0, 0] for K in found.Ks] == focals
 
 
 def test_the_estimation_of_poses_is_told_what_it_needs(pair_files, monkeypatch):

@@ -315,6 +315,26 @@ def test_one_length_gives_all_and_without_one_nothing_says_metres(way, model, tm
     assert run.load_solved(tmp_path / "out/poses.npz", "") is None
 
 
+def test_neighbours_are_those_whose_rays_meet_at_the_best_angle():
+    """Forty points 10 m ahead, seen from the side at 2, 6, 12 and 30 degrees.
+
+    Worth exp(-((a - 6) / s)^2 / 2), s 2.5 below 6 degrees and 10 above; what is seen already counts half,
+    and a neighbour must be worth 15 % of the best.
+    """
+    points = np.random.default_rng(0).normal((0, 0, 10), 0.01, (40, 3))
+    E = np.tile(np.eye(4), (5, 1, 1))
+    E[1:, 0, 3] = 10 * np.tan(np.radians([2.0, 6.0, 12.0, 30.0]))
+    seen = tuple((np.zeros((len(which), 2)), which) for which in [np.arange(40)] * 5)
+    found = SolvedCapture("solved", E, E, np.tile(K, (5, 1, 1)), np.ones(5, bool), points, seen)
+    assert choose_neighbours(found, 0, 4) == [2, 3]  # 0.28 / 4 and 0.06 / 4 are too little
+    assert choose_neighbours(found, 0, 1) == [2]
+    halves = [(np.zeros((20, 2)), which) for which in np.split(np.arange(40), 2)]
+    for of_second, chosen in ((halves[0], [2]), (halves[1], [2, 1])):  # who sees what the other does not
+        some = replace(found, seen=(seen[0], halves[0], of_second, *seen[3:]))
+        assert choose_neighbours(some, 0, 3, among=[1, 2]) == chosen
+    assert choose_neighbours(found, 0, 3, among=[1, 4]) == [1]
+
+
 def test_a_doubt_about_the_poses_is_one_about_every_frame(tmp_path, monkeypatch):
     source = write_transforms(tmp_path, TRUE, GIVEN)
     uncertain = Message("capture.scale", "The scale is uncertain by 17 %.")
@@ -412,6 +432,28 @@ def test_shards_start_from_poses_that_were_solved_once_and_the_whole_joins_them(
     report = run.depth_capture(options)
     assert [frame["frame"] for frame in report["frames"]] == ["f02", "f04", "f06"] and len(written) == 3
     assert report["files"]["cloud_points"] > 0
+
+
+@pytest.mark.parametrize(
+    ("typed", "left", "cores", "free", "count"),
+    [
+        (None, 9, 4, 99.0, 4),
+        (None, 3, 4, 99.0, 3),  # no more than there are frames
+        (None, 0, 4, 99.0, 1),
+        (None, 9, 4, 2.9, 2),  # as far as the memory goes, in processes
+        (None, 9, 4, 0.4, 1),
+        (6, 9, 4, 2.0, 6),
+        (6, 2, 4, 99.0, 2),
+    ],
+)
+def test_a_process_a_core_works_on_frames_as_far_as_there_are_any(
+    typed, left, cores, free, count, monkeypatch
+):
+    monkeypatch.setattr(run, "available_cores", lambda: cores)
+    memory = SimpleNamespace(available=free * run.PROCESS_BYTES)
+    monkeypatch.setattr(run, "psutil", SimpleNamespace(virtual_memory=lambda: memory))
+    options = CaptureOptions(path="scan", device="cpu", processes=typed)
+    assert run._processes(options, left) == count
 
 
 def test_a_folder_holds_a_frame_only_if_its_report_says_that_it_was_made_from_the_same(tmp_path):

@@ -10,7 +10,7 @@ from PIL import Image
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.formats.images import intrinsics_from_exif, intrinsics_from_fov
-from geodiff_plugin.pose.estimate import estimate_pose, find_scale
+from geodiff_plugin.pose.estimate import EstimatedPose, _same_unit, estimate_pose, find_scale
 from geodiff_plugin.pose.solve import (
     MOST_SPREAD,
     SCALE_PX,
@@ -19,7 +19,7 @@ from geodiff_plugin.pose.solve import (
     solve_poses,
     undetermined_pose,
 )
-from geodiff_plugin.pose.tracks import Tracks, solve_inverse_depth
+from geodiff_plugin.pose.tracks import Tracks, match_features, solve_inverse_depth
 from tests.scenes import render_pair
 from tests.unit.test_pose_refine import TRUE, K, angle_deg, make_tracks, pose
 
@@ -192,3 +192,32 @@ def test_focal_lengths_of_photographs(tmp_path) -> None:
     assert found[0, 0] == pytest.approx(320.0) and found[1, 2] == 239.5
     with pytest.raises(ValueError, match="fov"):
         intrinsics_from_fov(0.1, (640, 480))
+
+
+@pytest.mark.parametrize(("ratio", "kept"), [(0.79, True), (0.81, False)])
+def test_a_match_is_nearer_than_four_fifths_of_the_next_nearest(ratio: float, kept: bool) -> None:
+    """Lowe's test, of distances between unit vectors and not of their squares."""
+
+    def at_distance(distance: float, up: float = 0.0) -> np.ndarray:
+        angle = 2 * np.arcsin(distance / 2)
+        return np.array([np.cos(angle), np.sin(angle), up], np.float32)
+
+    none = np.zeros((2, 4))
+    left = none, np.stack([at_distance(0.0), np.array([0, 0, 1], np.float32)])
+    right = none, np.stack([at_distance(0.5), at_distance(0.5 * ratio)])
+    assert match_features(left, right).tolist() == ([[0, 1]] if kept else [])
+
+
+def test_baselines_of_several_views_are_in_units_of_the_first() -> None:
+    """Of cameras 0.3 m and 0.75 m away, both estimated with a baseline of 1."""
+    at_m = (0.3, 0.75)
+    tracks, Ts, _ = make_tracks([pose((0, 2.0 * x, 0), (x, 0.0, 0.1 * x)) for x in at_m], outliers=0.0)
+    lengths = np.linalg.norm(Ts[:, :3, 3], axis=1)
+    estimated = []
+    for T, length in zip(Ts, lengths, strict=True):
+        T = T.copy()
+        T[:3, 3] /= length
+        estimated.append(EstimatedPose(T, np.ones(len(tracks), bool), 1.0, 0.1, False, ()))
+    found = _same_unit(tracks, estimated, 1).T
+    assert np.linalg.norm(found[:3, 3]) == pytest.approx(lengths[1] / lengths[0], rel=0.01)
+    np.testing.assert_allclose(found[:3, :3], Ts[1, :3, :3])

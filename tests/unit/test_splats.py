@@ -155,6 +155,7 @@ def test_turned_pictures_stay_as_stored(tmp_path):
     capture = Capture.open(source)
     written(capture, tmp_path / "out", loader(capture), transforms_of(source))
     check(tmp_path / "out")
+    assert (tmp_path / "out/images/f02.png").read_bytes() == path.read_bytes()
 
 
 def test_any_other_capture_gets_one_too(tmp_path):
