@@ -540,6 +540,103 @@ MUTANTS = [
         tests=(f"{UNIT}capture.py",),
     ),
     *of(
+        "algorithm/correction.py",
+        ("antialias=size < target.size", "antialias=size > target.size"),
+        tests=(f"{UNIT}algorithm.py",),
+    ),
+    *of(
+        "capture/agreement.py",
+        ("(z > 1e-6) & (u > -0.5) & (v > -0.5)", "(z > 1e-6) & (u >= 0) & (v >= 0)"),
+        ("observers=np.maximum(observers, confirmed)", "observers=observers"),
+        (
+            "np.where(said.agrees, 1.0 - RISES * said.confidence, 1.0)",
+            "np.where(said.agrees, 1.0 - RISES, 1.0)",
+        ),
+        ("(depth < (1 - SAME_SHARE) * frame.depth)", "(depth > (1 + SAME_SHARE) * frame.depth)"),
+        ("np.argsort(-z[inside], kind", "np.argsort(z[inside], kind"),
+        ("same &= (depths > 0) & (depths[candidate] > 0)", "same &= depths[candidate] > 0"),
+        tests=CAPTURES,
+    ),
+    *of(
+        "capture/frames.py",
+        ("frames[seen] >= FEWEST_FRAMES", "frames[seen] > FEWEST_FRAMES"),
+        tests=CAPTURES,
+    ),
+    *of(
+        "capture/frames.py",
+        (
+            "angle < BEST_ANGLE_DEG, NARROWER_DEG, WIDER_DEG",
+            "angle < BEST_ANGLE_DEG, WIDER_DEG, NARROWER_DEG",
+        ),
+        tests=(f"{UNIT}capture.py",),
+    ),
+    *of(
+        "capture/splats.py",
+        ("(frame.as_stored or not is_turned(frame.image))", "not is_turned(frame.image)"),
+        tests=(f"{UNIT}splats.py",),
+    ),
+    *of(
+        "evidence/inputs.py",
+        ("np.isfinite(array) & (array > 0)", "np.isfinite(array) & (array >= 0)"),
+        tests=(f"{UNIT}known_points.py",),
+    ),
+    *of(
+        "pose/estimate.py",
+        ("np.median(other / np.maximum(first, 1e-9))", "np.median(first / np.maximum(other, 1e-9))"),
+        tests=(f"{UNIT}pose_estimate.py",),
+    ),
+    *of(
+        "pose/tracks.py",
+        ("_RATIO**2 * (1.0 - second)", "_RATIO * (1.0 - second)"),
+        tests=(f"{UNIT}pose_estimate.py",),
+    ),
+    *of(
+        "formats/image_files.py",
+        ("(exact or claims[path] == 1)", "claims[path] == 1"),
+        ("return _Found(path, start == 0)", "return _Found(path, True)"),
+        tests=(f"{UNIT}moved_images.py",),
+    ),
+    *of(
+        "jobs/finished.py",
+        (".st_size > 0", ".st_size >= 0"),
+        ("digests.get(path, digest) != digest", "digests.get(path) != digest"),
+        tests=(f"{UNIT}finished.py",),
+    ),
+    *of(
+        "jobs/many.py",
+        ("record = record | (there or {})", "record = (there or {}) | record"),
+        tests=(f"{UNIT}finished.py",),
+    ),
+    *of(
+        "jobs/capture.py",
+        (
+            'read_report(folder).get("made_from") == item.inputs',
+            'read_report(folder).get("frame") == item.key',
+        ),
+        ("return max(1, min(wanted, left))", "return max(1, wanted)"),
+        tests=(f"{UNIT}capture.py",),
+    ),
+    *of(
+        "jobs/rows.py",
+        ("depth_mm(depth_m * single_map(run.output.valid))", "depth_mm(depth_m)"),
+        tests=(f"{UNIT}rows.py",),
+    ),
+    *of(
+        "jobs/reading.py",
+        ("options.view_k[i - 2]", "options.view_k[i - 1]"),
+        ("if i == 1 and options.k_right", "if i > 0 and options.k_right"),
+        ("or [rig.K_left] * len(options.view)", "or [rig.K_right] * len(options.view)"),
+        tests=("tests/cli/test_estimate_pose.py",),
+    ),
+    *of(
+        "runtime/run.py",
+        (
+            "# replaced, or changed in place\n                self._results[-1] = None",
+            "\n                pass",
+        ),
+        tests=("tests/integration/test_guided_call.py",),
+    ),
+    *of(
         "pose/tearing.py",
         ("np.abs(below - beside[::-1])", "np.abs(below - beside)"),
         ("heights[view] / len(greys[view])", "heights[0] / len(greys[0])"),
