@@ -499,9 +499,15 @@ MUTANTS = [
         tests=("tests/contracts/test_formats.py",),
     ),
     *of(
-        "formats/storage.py",
+        "formats/named.py",
         ('[named.get("D", ())] * 2', "[(), ()]"),
-        ("if differ and name in FOR_BOTH", "if False and name in FOR_BOTH"),
+        ("if differ and (name in FOR_BOTH or", "if False and (name in FOR_BOTH or"),
+        ("E[:3, 3] /= units or 1.0", "E[:3, 3] *= units or 1.0"),
+        ('np.linalg.inv(pose) if R == "R" else pose', 'pose if R == "R" else np.linalg.inv(pose)'),
+        tests=("tests/contracts/test_formats.py",),
+    ),
+    *of(
+        "formats/storage.py",
         ("level < MOST_LEVELS", "level < 1"),
         ('side = f"{sides.pop()}."', 'side = f"{sides}."'),
         tests=("tests/contracts/test_formats.py",),
@@ -645,7 +651,7 @@ MUTANTS = [
     ),
     *of(
         "matching/uprights.py",
-        ("_certain_median(flat - pitch)", "_certain_median(flat + pitch)"),
+        ("_certain_median(flat - float(", "_certain_median(flat + float("),
         ("min(certain, key=abs) if certain[0]", "max(certain, key=abs) if certain[0]"),
         tests=(f"{UNIT}uprights.py",),
     ),
