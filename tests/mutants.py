@@ -502,7 +502,7 @@ MUTANTS = [
         "formats/named.py",
         ('[named.get("D", ())] * 2', "[(), ()]"),
         ("if differ and (name in FOR_BOTH or", "if False and (name in FOR_BOTH or"),
-        ("E[:3, 3] /= units or 1.0", "E[:3, 3] *= units or 1.0"),
+        ("return in_units(rig, units or 1.0)", "return rig"),
         ('np.linalg.inv(pose) if R == "R" else pose', 'pose if R == "R" else np.linalg.inv(pose)'),
         tests=("tests/contracts/test_formats.py",),
     ),
