@@ -256,8 +256,8 @@ MUTANTS = [
     ),
     *of(
         "result/confidence.py",
-        ("0.94, -15.0)", "-0.94, -15.0)"),
-        ("0.94, -15.0)", "0.94, 15.0)"),
+        ("0.94, 0.", "-0.94, 0."),
+        (", -15.0)", ", 15.0)"),
         ("\nFEW = 0.02", "\nFEW = 0.03"),
         ("\nHALF_KNOWN = 0.1", "\nHALF_KNOWN = 0.12"),
         ("torch.minimum(best, error), best)", "error, best)"),

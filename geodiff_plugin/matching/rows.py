@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.geometry import image_size, is_rectified, resize_image, size_within, to_device_of
 from geodiff_plugin.matching.census import grey
+from geodiff_plugin.matching.consistency import known_share
+from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.uprights import certain_shear
 from geodiff_plugin.types import CameraView, PosedViews
 
@@ -29,6 +33,16 @@ MIN_SHIFT_PX = 0.3
 MAX_SHIFT = 0.3
 #: Most pixels of the pictures that are matched; larger ones are made smaller.
 MOST_PIXELS = 600_000
+#: The least step of shift that hides a strip of the farther surface, pixels: below it, matches differ by
+#: chance.
+LEAST_STEP_PX = 2.0
+#: How much wider than its step of shift a hidden strip may seem, pixels: matches end before an edge.
+SLACK_PX = 2.0
+#: Confidence of what is put into a hidden strip where the matches around it know enough: it is a guess that
+#: the farther surface goes on, and on a blank wall the end of the strip is one as well.
+HIDDEN_CONFIDENCE = 0.8
+#: A match in a hidden strip is kept from this confidence on.
+LEAST_KEPT = 0.05
 
 
 class RowMatches(NamedTuple):
@@ -36,9 +50,15 @@ class RowMatches(NamedTuple):
 
     shift: Tensor  # pixels from where the point would be at infinity, >= 0
     matched: Tensor  # 1 where both views agree, else 0
-    filled: Tensor  # 1 in a gap between two matches, where the shift is that of the farther one
+    hidden: Tensor  # 1 in a gap between two that the right view cannot see (``hidden_gaps``)
+    filled: Tensor  # 1 in another gap between two; the shift of a gap is that of its farther end
     baseline_m: Tensor  # () distance of the cameras, metres, on the CPU
     shear: float = math.nan  # of the right picture along its rows, pixels per row, as far as it is certain
+
+    @property
+    def certain(self) -> Tensor:
+        """1 where the shift is matched, or that of the surface which goes on behind a nearer one, else 0."""
+        return self.matched + self.hidden
 
 
 def make_matcher(lowest: int, count: int, channels: int) -> Any:
@@ -60,6 +80,34 @@ def pad_columns(image: np.ndarray, count: int) -> np.ndarray:
     return np.ascontiguousarray(np.pad(image, pads, mode="edge"))
 
 
+def _nearest_known(known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns of the nearest known pixels of the row to the left and to the right, ``(H, W)`` each.
+
+    Of a known pixel both are its own; where there is none, -1 and the width.
+    """
+    columns, width = np.arange(known.shape[1])[None], known.shape[1]
+    from_left = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
+    from_right = np.minimum.accumulate(np.where(known, columns, width)[:, ::-1], axis=1)[:, ::-1]
+    return from_left, from_right
+
+
+def hidden_gaps(shift: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """``(H, W)`` bool: gaps between matches that a view to the right cannot see.
+
+    A surface hides a strip of what is behind its left edge, and the strip is as wide as the shift of the near
+    surface exceeds that of the far one. A wider gap, or one without such a step, has another reason.
+
+    Args:
+        shift: ``(H, W)`` pixels; it falls with depth.
+        known: ``(H, W)`` bool, where it is matched.
+    """
+    from_left, from_right = _nearest_known(known)
+    padded = np.pad(np.where(known, shift, np.nan), ((0, 0), (1, 1)), constant_values=np.nan)
+    rows = np.arange(shift.shape[0])[:, None]
+    step = padded[rows, from_right + 1] - padded[rows, from_left + 1]
+    return ~known & (step > LEAST_STEP_PX) & (from_right - from_left - 1 <= step + SLACK_PX)
+
+
 def fill_background(shift: np.ndarray) -> np.ndarray:
     """Fill holes with the farther of the two neighbours in the row, as KITTI's development kit does.
 
@@ -67,9 +115,7 @@ def fill_background(shift: np.ndarray) -> np.ndarray:
     counts; an empty row copies the nearest filled one above, else below. NaN everywhere if all is unknown.
     """
     known = np.isfinite(shift)
-    columns = np.arange(shift.shape[1])[None]
-    from_left = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
-    from_right = np.minimum.accumulate(np.where(known, columns, shift.shape[1])[:, ::-1], axis=1)[:, ::-1]
+    from_left, from_right = _nearest_known(known)
     rows = np.arange(shift.shape[0])[:, None]
     padded = np.pad(np.where(known, shift, np.inf), ((0, 0), (1, 1)), constant_values=np.inf)
     filled = np.minimum(padded[rows, from_left + 1], padded[rows, from_right + 1])
@@ -132,9 +178,35 @@ def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: fl
     if mirrored:  # mirrored, a view to the left becomes one to the right
         images, infinity = [image[:, ::-1] for image in images], -infinity
     shift, known = _row_shifts(images[0], images[1], infinity, nearest_px)
-    shear = certain_shear(np.ascontiguousarray(images[0]), shift, known)
+    hidden = hidden_gaps(shift, known)
     between = np.logical_or.accumulate(known, 1) & np.logical_or.accumulate(known[:, ::-1], 1)[:, ::-1]
+    filled = between & ~known & ~hidden
+    shear = certain_shear(np.ascontiguousarray(images[0]), shift, known)
     shift = np.nan_to_num(fill_background(np.where(known, shift, np.float32(np.nan))))
-    maps = np.stack([shift, known, between & ~known])
-    shift_on, matched, filled = to_device_of(left_01, maps[..., ::-1] if mirrored else maps)
-    return RowMatches(shift_on, matched, filled, torch.tensor(abs(T[0, 3]), device="cpu"), shear)
+    maps = np.stack([shift, known, hidden, filled])
+    shift_on, *seen = to_device_of(left_01, maps[..., ::-1] if mirrored else maps)
+    return RowMatches(shift_on, *seen, torch.tensor(abs(T[0, 3]), device="cpu"), shear)
+
+
+def with_hidden(matches: Matches, rows: RowMatches, focal_px: float) -> Matches:
+    """Matches with the depth of the farther surface in the strips that the right view cannot see.
+
+    Nothing is matched there, and a fit would carry the nearer surface on until the image has an edge. They
+    count as much as the matches around them know (``known_share``).
+
+    Args:
+        matches: ``(1, 1, h, w)``, on any grid.
+        rows: of the same images.
+        focal_px: focal length along the rows, pixels of the grid of ``rows``.
+    """
+    layers = torch.stack([rows.shift, rows.hidden])[None]
+    shift, hidden = F.interpolate(layers, matches.size, mode="nearest-exact").split(1, 1)
+    put = (hidden > 0) & (shift > 0) & (matches.confidence < LEAST_KEPT)
+    inverse_depth = shift / (focal_px * rows.baseline_m)
+    confidence = HIDDEN_CONFIDENCE * known_share(matches)
+    return replace(
+        matches,
+        inverse_depth=torch.where(put, inverse_depth, matches.inverse_depth),
+        confidence=torch.where(put, confidence, matches.confidence),
+        deviation=None if matches.deviation is None else torch.where(put, 1.0, matches.deviation),
+    )

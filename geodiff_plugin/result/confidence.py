@@ -11,7 +11,7 @@ from torch import Tensor
 
 from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin._strips import row_strips
-from geodiff_plugin.algorithm.correction import log_depth_at
+from geodiff_plugin.algorithm.correction import log_depth_at, range_around
 from geodiff_plugin.algorithm.terms import match_exposure
 from geodiff_plugin.geometry import as_fine_as, image_size, warp_right_to_left
 from geodiff_plugin.matching import Matches, window_mean
@@ -21,8 +21,8 @@ from geodiff_plugin.types import CameraView
 RIGHT_WITHIN = 0.1
 #: Log-odds, by logistic regression on pairs with truth, every pair weighing the same
 #: (``python -m tests.benchmarks.confidence`` refits them): constant, certainty, closeness of the matches,
-#: steadiness, and relative spread of the ensemble (by hand: 10 % quarter the odds).
-BY_EVIDENCE = (-1.9, 0.36, 1.04, 0.94, -15.0)
+#: steadiness, evenness, and relative spread of the ensemble (by hand: 10 % quarter the odds).
+BY_EVIDENCE = (-3.0, 0.36, 1.04, 0.94, 0.4, -15.0)
 #: A smaller error that is left in a depth makes no difference.
 LEAST_LEFT = 0.0005
 #: Nor does a larger one.
@@ -44,6 +44,13 @@ FEW = 0.02
 STEADY = 0.005
 #: Nor does a larger one.
 MOVED = 0.2
+#: Half width in px of the window, on the grid of the matches, in which a depth is compared with others: what
+#: is wrong at an edge of depth, and in the strip that it hides, is wrong within some pixels of it.
+EVEN_REACH = 4
+#: A smaller range of log depth in it makes no difference: surfaces slope.
+EVEN = 0.01
+#: Nor does a larger one.
+STEPPED = 0.5
 #: Known share of the matches around a pixel from which on they determine what their support says.
 DETERMINED_FROM = 0.33
 #: Support at which the prior's error is half known: it is measured where there are matches, and a prior that
@@ -63,13 +70,15 @@ class Grounds(NamedTuple):
     support: Tensor  # of ``fit_depth``, [0, 1]
     apart: Tensor  # mean distance of the matches around a pixel from its depth, in planes
     moved: Tensor  # mean change of log depth around it since the denoising; the fewer matches, the larger
+    stepped: Tensor  # range of log depth around it
 
 
 def grounds_of(denoised_m: Tensor, depth_m: Tensor, target: Matches, support: Tensor) -> Grounds:
-    """What a depth rests on: its support, how near the matches are to it, how little it was corrected.
+    """What a depth rests on: its support, how near the matches are to it, what corrected it, how even it is.
 
     Support says how much the matches of a place weigh, not whether they agree. Where they scatter around the
-    depth, or the last fit had to change the denoised map, the depth is often wrong.
+    depth, or the last fit had to change the denoised map, the depth is often wrong; and so it is beside a
+    step from one surface to another, whose place is uncertain.
 
     Args:
         denoised_m: ``(1, 1, H, W)`` metres, the map before it was fitted to the matches for the last time.
@@ -87,19 +96,20 @@ def grounds_of(denoised_m: Tensor, depth_m: Tensor, target: Matches, support: Te
     known = target.confidence.clamp_max(1.0).mean((2, 3), keepdim=True)
     share = known / (known + FEW)
     moved = moved.clamp(STEADY, MOVED) ** share * MOVED ** (1.0 - share)
-    both = F.interpolate(torch.cat([apart, moved], 1), image_size(support), mode="bilinear")
-    return Grounds(support, *both.split(1, 1))
+    stepped = range_around(log_depth, EVEN_REACH)
+    found = F.interpolate(torch.cat([apart, moved, stepped], 1), image_size(support), mode="bilinear")
+    return Grounds(support, *found.split(1, 1))
 
 
 def depth_evidence(grounds: Grounds, spread: Tensor | None, prior_error: Tensor | None = None) -> Tensor:
-    """Features ``(B, 5, H, W)`` of the logistic model in ``depth_confidence``, whose arguments these are.
+    """Features ``(B, 6, H, W)`` of the logistic model in ``depth_confidence``, whose arguments these are.
 
-    They are 1, certainty, closeness, steadiness and spread. With less support, a pixel's prior error e moves
-    from the measured one towards a useless prior's. Certainty is the log of .05 over the remaining error,
-    ``(1 - support) * e``, closeness that of 10 planes over the distance of the matches, and steadiness that
-    of .2 over the correction.
+    They are 1, certainty, closeness, steadiness, evenness and spread. With less support, a pixel's prior
+    error e moves from the measured one towards a useless prior's. Certainty is the log of .05 over the
+    remaining error, ``(1 - support) * e``, closeness that of 10 planes over the distance of the matches,
+    steadiness that of .2 over the correction, and evenness that of .5 over the range of log depth around.
     """
-    support, apart, moved = grounds
+    support, apart, moved, stepped = grounds
     measured = support.new_tensor(USELESS) if prior_error is None else prior_error.clamp(BEST, USELESS)
     share = support / (support + HALF_KNOWN)
     left = (1.0 - support) * measured**share * USELESS ** (1.0 - share)
@@ -108,6 +118,7 @@ def depth_evidence(grounds: Grounds, spread: Tensor | None, prior_error: Tensor 
         -(left.clamp(LEAST_LEFT, MOST_LEFT) / MOST_LEFT).log(),
         -(apart.clamp(CLOSE, FAR) / FAR).log(),
         -(moved.clamp(STEADY, MOVED) / MOVED).log(),
+        -(stepped.clamp(EVEN, STEPPED) / STEPPED).log(),
         torch.zeros_like(support) if spread is None else spread,
     ]
     return torch.cat(evidence, dim=1)
@@ -129,7 +140,7 @@ def depth_confidence(grounds: Grounds, spread: Tensor | None, prior_error: Tenso
         return kernels.confidence_of(grounds, spread, prior_error)
     weights = support.new_tensor(BY_EVIDENCE).view(1, -1, 1, 1)
     confidence = torch.empty_like(support)
-    for rows in row_strips(*size):  # the features take five times as much memory as the result
+    for rows in row_strips(*size):  # the features take six times as much memory as the result
         part = Grounds(*(x[:, :, rows] for x in grounds))
         further = (None if x is None else x.expand_as(support)[:, :, rows] for x in (spread, prior_error))
         confidence[:, :, rows] = torch.sigmoid(

@@ -21,6 +21,7 @@ from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.geometry import image_size, resize_intrinsics
 from geodiff_plugin.matching import Matches, build_cost_volume, known_share, match_volume
+from geodiff_plugin.matching.rows import with_hidden
 from geodiff_plugin.messages import Message
 from geodiff_plugin.result.confidence import (
     Grounds,
@@ -212,17 +213,30 @@ def refine(
     target = correction_target(matches, points, weight, error, depth_m)
     if target is None or error is None:
         return None
+    if matches is not None:
+        target = _with_hidden(target, evidence)
     fit = fit_depth(depth_m, target, evidence.native.left_01[None], error, config)
     fitted_m, support = fit.depth_m, fit.support
     if matches is not None:
         measured = error.amin((2, 3), keepdim=True)  # its value where the prior gives a depth
         target = correction_target(matches, points, weight, error, fitted_m)
         assert target is not None  # there are matches
-        known = known_share(target)
-        fitted_m = vote_depth(fitted_m, evidence, target, known, measured, spacing)
-        fitted_m = flatten(fitted_m, target, left_01, measured)
+        completed = _with_hidden(target, evidence)
+        known = known_share(completed)
+        fitted_m = vote_depth(fitted_m, evidence, completed, known, measured, spacing)
+        fitted_m = flatten(fitted_m, completed, left_01, measured)
         support = fit.support * determined(known, image_size(fit.support))
     return Refined(fitted_m, support, grounds_of(denoised_m, fitted_m, target, fit.support))
+
+
+def _with_hidden(target: Matches, evidence: Evidence) -> Matches:
+    """Matches, and what lies behind nearer surfaces where rows of the image were matched."""
+    rows = None if evidence.rows is None else evidence.rows.result()
+    if rows is None:
+        return target
+    native = evidence.native
+    focal_px = float(native.K_left[0, 0]) * rows.shift.shape[1] / native.size[1]
+    return with_hidden(target, rows, focal_px)
 
 
 def _member_at(size: tuple[int, int], member: Member, like: Tensor, options: ResultOptions) -> Tensor:

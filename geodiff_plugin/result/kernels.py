@@ -47,11 +47,15 @@ _RISE = tl.constexpr(voting.RISE)
 _NEAREST = tl.constexpr(voting.NEAREST)
 _EDGE_PX = tl.constexpr(EDGE_PX)
 _NEAREST_M = tl.constexpr(NEAREST_M)
-_CONSTANT, _CERTAINTY, _CLOSENESS, _STEADINESS, _SPREAD_COUNTS = map(tl.constexpr, confidence.BY_EVIDENCE)
+_CONSTANT, _CERTAINTY, _CLOSENESS, _STEADINESS, _EVENNESS, _SPREAD_COUNTS = map(
+    tl.constexpr, confidence.BY_EVIDENCE
+)
 _CLOSE = tl.constexpr(confidence.CLOSE)
 _FAR = tl.constexpr(confidence.FAR)
 _STEADY = tl.constexpr(confidence.STEADY)
 _MOVED = tl.constexpr(confidence.MOVED)
+_EVEN = tl.constexpr(confidence.EVEN)
+_STEPPED = tl.constexpr(confidence.STEPPED)
 _LEAST_LEFT = tl.constexpr(confidence.LEAST_LEFT)
 _MOST_LEFT = tl.constexpr(confidence.MOST_LEFT)
 _BEST = tl.constexpr(confidence.BEST)
@@ -106,7 +110,7 @@ def _error_and_map_vote(error, crispness):
 
 @triton.jit
 def vote_kernel(
-    depth_m, inverse_depth, confidence, known, row_shift, matched, filled, image, error, crispness, voted,
+    depth_m, inverse_depth, confidence, known, row_shift, certain, filled, image, error, crispness, voted,
     px, closeness, height, width, CHANNELS: tl.constexpr, BLOCK: tl.constexpr, VOTES: tl.constexpr,
 ):  # fmt: skip
     """The votes around every pixel, weighed, and the mean of those near their weighted median."""
@@ -123,7 +127,7 @@ def vote_kernel(
     know, sure = tl.load(known + at), tl.load(confidence + at)
     weight = tl.where(
         of_row,
-        know * (tl.load(matched + at) * _ROWS + tl.load(filled + at) * _FILLED),
+        know * (tl.load(certain + at) * _ROWS + tl.load(filled + at) * _FILLED),
         know * tl.minimum(tl.maximum(sure, 0.0), 1.0),
     )
     shift = px / tl.load(depth_m + at)  # of the map there
@@ -182,7 +186,7 @@ def _in_units(value, least, most):
 
 @triton.jit
 def confidence_kernel(
-    support, apart, moved, spread, prior_error, confident, pixels,
+    support, apart, moved, stepped, spread, prior_error, confident, pixels,
     SPREAD: tl.constexpr, PRIOR: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip
     """``confidence.depth_confidence``. Grid: blocks of pixels, maps.
@@ -206,6 +210,7 @@ def confidence_kernel(
     odds = _in_units(left, _LEAST_LEFT, _MOST_LEFT) * _CERTAINTY + _CONSTANT
     odds += _in_units(tl.load(apart + at, exists, 1.0), _CLOSE, _FAR) * _CLOSENESS
     odds += _in_units(tl.load(moved + at, exists, 1.0), _STEADY, _MOVED) * _STEADINESS
+    odds += _in_units(tl.load(stepped + at, exists, 1.0), _EVEN, _STEPPED) * _EVENNESS
     if SPREAD:
         odds += tl.load(spread + at, exists, 0.0) * _SPREAD_COUNTS
     tl.store(confident + at, 1.0 / (1.0 + tl.exp(-odds)), exists)
@@ -295,7 +300,8 @@ def warped(
 def voted(given: voting.Voters, left: Tensor, error: Tensor, crispness: Tensor) -> Tensor:
     """``voting._voted``."""
     height, width = given.depth_m.shape
-    maps = [each.contiguous() for each in (*given[:4], *given.rows[:3], left)]
+    of_rows = given.rows.shift, given.rows.certain, given.rows.filled
+    maps = [each.contiguous() for each in (*given[:4], *of_rows, left)]
     raw, smooth = torch.empty_like(maps[0]), torch.empty_like(maps[0])
     grid = (triton.cdiv(height * width, BLOCK),)
     closeness = sum(math.exp(-(v**2 + u**2) / (2.0 * REACH**2)) for v, u in voting.WINDOW)

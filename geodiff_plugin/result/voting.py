@@ -32,7 +32,8 @@ BRIGHTNESS = 0.1
 WINDOW = [(v, u) for v in range(-HALF, HALF + 1) for u in range(-HALF, HALF + 1) if (v + u) % 2 == 0]
 #: Pixels between samples of the window: it has to reach beyond the ragged border of a sweep's match.
 SPACING = 4
-#: Weight of a row match relative to a sure match of the sweep: it places edges on a finer grid.
+#: Weight of a row match, and of a hidden strip, relative to a sure match of the sweep: they place edges on a
+#: finer grid.
 ROWS = 1.5
 #: The same of a gap filled from the farther surface, which is a guess.
 FILLED = 0.5
@@ -112,7 +113,8 @@ def vote_depth(
     deviations ``s``, of match and map together, it differs from the map. Where the matches of a place know
     little, as on a blank wall, all of them count less: ``k`` is their ``known_share``.
 
-    Rows of a rectified view, matched at this resolution, place edges that the sweep's grid cannot resolve.
+    Rows of a rectified view, matched at this resolution, place edges that the sweep's grid cannot resolve,
+    and say which surface goes on behind an edge.
     Without them the map is returned unchanged. Pictures of more than ``rows.MOST_PIXELS`` vote on a smaller
     grid, whose depth is enlarged, guided by colour.
 
@@ -161,7 +163,7 @@ def _voted(given: Voters, left: Tensor, error: Tensor, crispness: Tensor) -> Ten
     error = _error_at_edges(error, crispness)
     map_vote = MAP_VOTE * (WEAK_PRIOR / error).clamp_min(1.0) ** 3
     rows, shift = given.rows, given.px / given.depth_m
-    of_rows = given.known * (ROWS * rows.matched + FILLED * rows.filled)
+    of_rows = given.known * (ROWS * rows.certain + FILLED * rows.filled)
     # The confidence of a known point is a count.
     of_matches = given.known * given.confidence.clamp(0.0, 1.0)
     voters = (
@@ -182,8 +184,8 @@ def _rows_on(size: tuple[int, int], rows: RowMatches) -> RowMatches:
     """Matches of rows on another grid: each pixel takes those of the nearest one."""
     if image_size(rows.shift) == size:
         return rows
-    shift, matched, filled = F.interpolate(torch.stack(rows[:3])[None], size, mode="nearest-exact")[0]
-    return RowMatches(shift * (size[1] / rows.shift.shape[1]), matched, filled, rows.baseline_m, rows.shear)
+    shift, *seen = F.interpolate(torch.stack(rows[:4])[None], size, mode="nearest-exact")[0]
+    return RowMatches(shift * (size[1] / rows.shift.shape[1]), *seen, rows.baseline_m, rows.shear)
 
 
 def _median_filtered(values: Tensor) -> Tensor:

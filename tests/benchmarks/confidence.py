@@ -67,7 +67,7 @@ __all__ = [
 ]
 
 #: Which sign each coefficient of ``consistency.LOG_ODDS``, and of ``BY_EVIDENCE``, may have; 0 for any.
-MATCH_SIGNS, SIGNS = (0, 1, -1, -1), (0, 1, 1, 1, -1)
+MATCH_SIGNS, SIGNS = (0, 1, -1, -1), (0, 1, 1, 1, 1, -1)
 
 
 def promised(evidence: np.ndarray, coefficients: Sequence[float] | np.ndarray) -> np.ndarray:

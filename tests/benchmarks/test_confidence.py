@@ -134,7 +134,7 @@ def test_the_command_prints_constants_that_can_be_pasted(capsys):
     for line in printed.splitlines():
         if line.startswith(("LOG_ODDS", "BY_EVIDENCE")):
             exec(line, names)  # as pasted
-    assert len(names["LOG_ODDS"]) == 4 and len(names["BY_EVIDENCE"]) == 5
+    assert len(names["LOG_ODDS"]) == 4 and len(names["BY_EVIDENCE"]) == 6
     assert names["BY_EVIDENCE"][-1] == -15.0  # one member has no spread: the shipped number stays
     assert "largest gap between promised and kept" in printed and "plain walls" in printed
 

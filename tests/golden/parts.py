@@ -375,7 +375,7 @@ def confidence() -> dict[str, object]:
     shape = (1, 1, *SIZE)
     support, other = (torch.rand(shape, generator=torch.Generator().manual_seed(k)) for k in (0, 1))
     spread = 0.1 * support.roll(7, -1)
-    grounds = Grounds(support**3, 12.0 * support.roll(5, -2), 0.3 * other**3)
+    grounds = Grounds(support**3, 12.0 * support.roll(5, -2), 0.3 * other**3, 0.7 * other.roll(3, -1) ** 3)
     of_prior = {"good": 0.02, "poor": 0.12, "unknown": None}
     result: dict[str, object] = {}
     for name, e in of_prior.items():

@@ -24,7 +24,8 @@ def random_voters(seed: int, size: tuple[int, int], device: torch.device) -> tup
     confidence = rand(*size) * (rand(*size) > 0.3) + 3.0 * (rand(*size) > 0.95)  # some known points
     matched = (rand(*size) > 0.5).float()
     shift = px.to(device) / depth_m * (1.0 + 0.1 * rand(*size))
-    rows = RowMatches(shift, matched, (1.0 - matched) * (rand(*size) > 0.5), torch.tensor(0.1))
+    gap, seen = 1.0 - matched, rand(*size) > 0.5
+    rows = RowMatches(shift, matched, gap * ~seen, gap * seen * (rand(*size) > 0.5), torch.tensor(0.1))
     return Voters(depth_m, inverse_depth, confidence, rand(*size), rows, px), rand(3, *size)
 
 
@@ -65,7 +66,7 @@ def test_confidence(device, seed, batch, size, spread, prior):
     def rand(*shape: int) -> torch.Tensor:
         return torch.rand(batch, 1, *shape, generator=generator).to(device)
 
-    grounds = Grounds(rand(*size), 12.0 * rand(*size), 0.3 * rand(*size) ** 3)
+    grounds = Grounds(rand(*size), 12.0 * rand(*size), 0.3 * rand(*size) ** 3, 0.7 * rand(*size) ** 3)
     given = grounds, 0.1 * rand(*size) if spread else None
     error = {"none": None, "number": 0.6 * rand(1, 1), "map": 0.6 * rand(*size)}[prior]
     found = depth_confidence(*given, error)

@@ -21,7 +21,7 @@ from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.prepare import rows_beside
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import Matches, known_share, rows
-from geodiff_plugin.matching.rows import match_rows
+from geodiff_plugin.matching.rows import hidden_gaps, match_rows, with_hidden
 from geodiff_plugin.result import voting
 from geodiff_plugin.result.misfit import MATCH_NOISE_PX, expected_error
 from geodiff_plugin.result.voting import vote_depth
@@ -357,6 +357,33 @@ def test_rows_are_matched_whatever_side_and_principal_point_the_view_has(side, d
     right = (found.shift - 18.0 / truth[0, 0]).abs()[seen] < 0.5
     assert seen.float().mean() > 0.6 and right.float().mean() > 0.9
     assert gaps.any() and not (gaps & seen).any()
+
+
+def test_a_gap_is_hidden_where_it_is_no_wider_than_the_step_beside_it():
+    """Gaps of 6 pixels: far before near, near before far, without a step, and with too small a step."""
+    ends = [(4.0, 10.0), (10.0, 4.0), (4.0, 4.0), (4.0, 7.0)]
+    shift = np.array([[far] * 5 + [0.0] * 6 + [near] * 5 for far, near in ends], np.float32)
+    known = shift > 0
+    found = hidden_gaps(shift, known)
+    assert found[0].tolist() == (~known[0]).tolist()
+    assert not found[1:].any()
+    assert not hidden_gaps(shift[:, 5:], known[:, 5:]).any()  # the gap has no farther end
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_the_strip_beside_a_near_surface_gets_the_depth_behind_it(side):
+    truth, left, view = scene(side)
+    rows = match_rows(left[0], view, CAMERA, 9.0)
+    assert (rows.hidden > 0).any() and not (rows.hidden * (rows.matched + rows.filled)).any()
+    sure = (rows.matched * (18.0 / truth[0, 0] - rows.shift).abs().lt(0.5)).view_as(truth)
+    matches = Matches(1.0 / truth, 0.9 * sure, torch.tensor([2e-3]))
+    found = with_hidden(matches, rows, float(CAMERA[0, 0]))
+    put = found.confidence != matches.confidence
+    assert put.any() and bool((put == ((rows.hidden > 0) & (sure == 0))).all())
+    right = (found.inverse_depth * truth - 1.0).abs()[put] < 0.1
+    assert right.float().mean() > 0.8
+    kept = ~put
+    assert torch.equal(found.inverse_depth[kept], matches.inverse_depth[kept])
 
 
 def test_a_map_of_another_size_takes_its_edges_from_the_same_rows():

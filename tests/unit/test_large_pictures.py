@@ -62,7 +62,7 @@ def test_rerendering_and_confidence_in_strips(textured_plane, monkeypatch):
         return (
             visible,
             error,
-            depth_confidence(Grounds(support, 9.0 * support, 0.1 * support), None),
+            depth_confidence(Grounds(support, 9.0 * support, 0.1 * support, 0.4 * support), None),
         )
 
     whole = told()

@@ -287,17 +287,27 @@ def _maps(*values: float) -> torch.Tensor:
 )
 def test_rises_with_support_and_falls_with_spread(support, spread, way):
     spread = None if spread is None else _maps(*spread)
-    grounds = Grounds(_maps(*support), _maps(1.0, 1.0, 1.0), _maps(0.02, 0.02, 0.02))
+    grounds = Grounds(_maps(*support), *(_maps(x, x, x) for x in (1.0, 0.02, 0.03)))
     found = depth_confidence(grounds, spread).flatten()
     assert (way * found.diff() > 0).all() and found.min() > 0 and found.max() < 1
 
 
-@pytest.mark.parametrize("name", ["apart", "moved"])
-def test_falls_with_the_distance_of_matches_and_with_the_last_correction(name):
-    grounds = Grounds(_maps(0.9, 0.9, 0.9), _maps(1.0, 1.0, 1.0), _maps(0.02, 0.02, 0.02))
+@pytest.mark.parametrize("name", ["apart", "moved", "stepped"])
+def test_falls_with_the_distance_of_matches_the_last_correction_and_steps_beside_it(name):
+    grounds = Grounds(*(_maps(x, x, x) for x in (0.9, 1.0, 0.02, 0.03)))
     grounds = grounds._replace(**{name: getattr(grounds, name) * _maps(1.0, 3.0, 9.0)})
     found = depth_confidence(grounds, None).flatten()
     assert (found.diff() < -0.02).all()
+
+
+def test_a_step_of_depth_reaches_some_pixels_to_both_sides():
+    depth_m = torch.full((1, 1, 20, 40), 2.0)
+    depth_m[..., 20:] = 3.0
+    target = Matches(1.0 / depth_m, torch.ones_like(depth_m), torch.tensor([0.004]))
+    stepped = grounds_of(depth_m, depth_m, target, torch.ones_like(depth_m)).stepped
+    expected = torch.zeros(40)
+    expected[16:24] = math.log(1.5)
+    torch.testing.assert_close(stepped[0, 0, 10], expected)
 
 
 def test_grounds_are_means_over_a_window_of_matches():
