@@ -200,8 +200,10 @@ def refine(
 ) -> Refined | None:
     """Sharpen the edges of a map of these members, fit it to its matches, let these vote, and flatten it.
 
-    Edges are sharpened first: then the fit does not carry the depth of one surface over to the next. Walls
-    are flattened last, as votes make patches of a wall whose matches are not precise.
+    Edges are sharpened first: then the fit does not carry the depth of one surface over to the next. Strips
+    that a nearer surface hides from the right view are fitted to the depth behind it, which the grounds of
+    confidence do not count as matches. Walls are flattened last, as votes make patches of a wall whose
+    matches are not precise.
     ``left_01 (1, 3, H, W)`` has the size of the map. ``None`` if there are neither matches nor points.
     """
     matches, points = Matches.stack([evidence.matches]), Matches.stack([evidence.points])
