@@ -184,8 +184,9 @@ def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: fl
     shear = certain_shear(np.ascontiguousarray(images[0]), shift, known)
     shift = np.nan_to_num(fill_background(np.where(known, shift, np.float32(np.nan))))
     maps = np.stack([shift, known, hidden, filled])
-    shift_on, *seen = to_device_of(left_01, maps[..., ::-1] if mirrored else maps)
-    return RowMatches(shift_on, *seen, torch.tensor(abs(T[0, 3]), device="cpu"), shear)
+    shift_on, matched, hidden_on, filled_on = to_device_of(left_01, maps[..., ::-1] if mirrored else maps)
+    baseline_m = torch.tensor(abs(T[0, 3]), device="cpu")
+    return RowMatches(shift_on, matched, hidden_on, filled_on, baseline_m, shear)
 
 
 def with_hidden(matches: Matches, rows: RowMatches, focal_px: float) -> Matches:
