@@ -122,6 +122,11 @@ def read_image(
     return image_01, notes
 
 
+#: The tag of an MPO file that says of what kind each of its pictures is, and what previews are called there.
+MPO_ENTRIES = 0xB002
+PREVIEW = "Thumbnail"
+
+
 def pages_of_both(path: PathLike, name: str) -> tuple[int, int]:
     """Numbers of the left and the right picture in an MPO or a spatial HEIC file.
 
@@ -130,10 +135,15 @@ def pages_of_both(path: PathLike, name: str) -> tuple[int, int]:
     """
     with open_image(path, name) as image:
         count, is_heic = int(getattr(image, "n_frames", 1)), image.format == "HEIF"
+        entries = (getattr(image, "mpinfo", None) or {}).get(MPO_ENTRIES) or ()
+        kinds = [str(entry["Attribute"]["MPType"]) for entry in entries]
         groups = image.info.get("entity_groups") or ()
     if not is_heic:
         if count != 2:
             bad_value(name, "an MPO file with two pictures, left one first", f"{count} in {path}")
+        if any(PREVIEW in kind for kind in kinds):
+            got = f"{path} of one view and its preview"
+            bad_value(name, "an MPO file of two views", got, "Give the right view as RIGHT.")
         return 0, 1
     pair = next((list(group["images"]) for group in groups if group["type"] == STEREO_GROUP), [])
     if len(pair) != 2 or None in pair:

@@ -14,6 +14,12 @@ LARGEST_16_BITS = 65535
 MAP_FILES = "a map (H, W) as .npy, .npz, .pfm, .exr, 16-bit .png or .tiff"
 #: Channels of an OpenEXR file that may hold depth, the first that is there.
 EXR_CHANNELS = ("Z", "Y", "R", "V")
+#: Those of a colour picture, which in a map are all the same.
+EXR_COLOURS = ("R", "G", "B")
+#: Depths that a PNG of bytes of floats may hold.
+LIKELY_DEPTH_M = (1e-3, 1e6)
+#: What a ``.dpt`` begins with.
+DPT_TAG = b"PIEH"
 
 
 def read_pfm(path: PathLike, name: str = "map") -> np.ndarray:
@@ -48,11 +54,34 @@ def _picture_map(file: Path, name: str) -> np.ndarray:
         mode, values = image.mode, np.asarray(image)
     if mode == "F":
         return values
+    if mode == "RGBA" and (floats := _floats_of_bytes(values)) is not None:
+        return floats
     if not mode.startswith("I"):
         bad_value(
             name, "a 16-bit grey PNG or TIFF", f"{file} of mode {mode}", "An 8-bit copy has lost the values."
         )
     return values.astype(np.uint16) if values.min() >= 0 and values.max() <= LARGEST_16_BITS else values
+
+
+def _floats_of_bytes(rgba: np.ndarray) -> np.ndarray | None:
+    """The ``(H, W)`` float32 metres that TartanAir V2 keeps in the bytes of a PNG, or ``None`` for a picture.
+
+    A picture's alpha of 255 makes no positive number. Source: ``depth_rgba_float32`` of
+    castacks/tartanairpy, whose OpenCV has blue first.
+    """
+    floats = np.ascontiguousarray(rgba[..., [2, 1, 0, 3]]).view("<f4")[..., 0]
+    with np.errstate(invalid="ignore"):
+        likely = (floats >= LIKELY_DEPTH_M[0]) & (floats <= LIKELY_DEPTH_M[1])
+    return floats.astype(np.float32) if likely.all() else None
+
+
+def _dpt_map(file: Path, name: str) -> np.ndarray:
+    """MPI Sintel's ``.dpt``. Source: its ``sintel_io.py``."""
+    data = file.read_bytes()
+    width, height = np.frombuffer(data[4:12].ljust(8, b"\0"), "<i4")
+    if data[:4] != DPT_TAG or min(width, height) < 1 or len(data) != 12 + 4 * int(width) * int(height):
+        bad_value(name, "a whole .dpt of MPI Sintel", file, "Is it cut off?")
+    return np.frombuffer(data, "<f4", offset=12).reshape(height, width)
 
 
 def _npy_map(file: Path, name: str) -> np.ndarray:
@@ -68,7 +97,7 @@ def _npz_map(file: Path, name: str) -> np.ndarray:
 
 
 def _exr_map(file: Path, name: str) -> np.ndarray:
-    """The only channel of an OpenEXR file, or its Z, Y or R."""
+    """The only channel of an OpenEXR file, or its Z, Y or R, where the colours are alike."""
     try:
         import OpenEXR
     except ImportError:
@@ -81,6 +110,9 @@ def _exr_map(file: Path, name: str) -> np.ndarray:
     key = next((key for key in EXR_CHANNELS if key in channels), next(iter(channels), ""))
     if not key:
         bad_value(name, "an OpenEXR file with a channel", file)
+    colours = [channels[colour] for colour in EXR_COLOURS if colour in channels]
+    if key == "R" and any(not np.array_equal(each, colours[0], equal_nan=True) for each in colours[1:]):
+        bad_value(name, "a map of depths", f"{file}, a colour picture", "Save the depth as a channel Z.")
     return channels[key].astype(np.float32)
 
 
@@ -89,5 +121,6 @@ MAP_READERS: dict[str, Callable[[Path, str], np.ndarray]] = {
     ".npz": _npz_map,
     ".pfm": read_pfm,
     ".exr": _exr_map,
+    ".dpt": _dpt_map,
 }
 """By suffix; another file is a picture."""

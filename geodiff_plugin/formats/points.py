@@ -15,13 +15,12 @@ from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.formats.depth import MILLIMETRES, PICTURES
 from geodiff_plugin.formats.files import PathLike, check_file, read_npy, read_rows
 from geodiff_plugin.formats.maps import read_map_file
+from geodiff_plugin.formats.pcd import read_pcd_points
 
 KINDS = (
     "a map (16-bit PNG or TIFF in mm; float TIFF, .exr, .pfm, .npy or .npz in metres) or points in metres "
     "(.npy, text, .ply, .pcd, .las)"
 )
-#: Letters of numpy's types for those of PCD.
-PCD_TYPES = {"F": "f", "U": "u", "I": "i"}
 #: What is not read, by suffix: what it is, and what makes points of it.
 FOREIGN = {
     ".bin": (
@@ -29,7 +28,16 @@ FOREIGN = {
         "geodiff depth reads them with KITTI's --calib (calib_velo_to_cam.txt beside it); in Python: "
         "formats.read_lidar(file, [calibration]).",
     ),
+    **dict.fromkeys(
+        (".h5", ".hdf5", ".mat"),
+        (
+            "an HDF5 or MATLAB file",
+            "Save its map as .npy: numpy.save('depth.npy', h5py.File(path)['depth']).",
+        ),
+    ),
 }
+#: Known points farther to the side are in the coordinates of a map.
+FARTHEST_SIDEWAYS_M = 1e5
 COLUMNS = (3, 4, 6)  # x y z, with an intensity, or with a colour
 NUMBER = re.compile(r"[-+]?(\d.*|\..*|nan|inf)", re.IGNORECASE)
 
@@ -51,7 +59,7 @@ def read_points(path: PathLike, name: str = "points", *, scale: float | None = N
         return _of_picture(file, name, scale)
     readers: dict[str, Callable[[Path, str], np.ndarray]] = {
         ".npy": lambda path, what: read_npy(path, what, KINDS),
-        **dict.fromkeys((".pfm", ".exr", ".npz"), read_map_file),
+        **dict.fromkeys((".pfm", ".exr", ".npz", ".dpt"), read_map_file),
         **dict.fromkeys((".las", ".laz"), read_las_points),
         **{".ply": read_ply_points, ".pcd": read_pcd_points},
     }
@@ -62,9 +70,22 @@ def read_points(path: PathLike, name: str = "points", *, scale: float | None = N
         values = values[:, :3]
     if scale is None:
         check_metres(values, name, f"{file} of {values.dtype}")
+    if values.shape[1] == 3:
+        _refuse_map_coordinates(values[:, :2] / (scale or 1.0), file, name)
     with np.errstate(over="ignore"):
         values = (values / (scale or 1.0)).astype(np.float32)
     return values if values.shape[1] == 3 else np.where(np.isfinite(values), values, np.float32(0))
+
+
+def _refuse_map_coordinates(sideways: np.ndarray, file: Path, name: str) -> None:
+    """Refuse points whose x and y are those of a map, as lidar surveys have them."""
+    middle = np.median(np.abs(sideways), axis=0)
+    if middle.max() > FARTHEST_SIDEWAYS_M:
+        expected = "points in the frame of the left camera (x right, y down, z forward)"
+        cure = "Move them there by the pose of the camera: (points - place) @ R."
+        bad_value(
+            name, expected, f"{file} with x and y of {middle[0]:.0f} and {middle[1]:.0f} m, a map's", cure
+        )
 
 
 def _of_picture(file: Path, name: str, scale: float | None) -> np.ndarray:
@@ -73,40 +94,6 @@ def _of_picture(file: Path, name: str, scale: float | None) -> np.ndarray:
     units = scale or (MILLIMETRES if values.dtype.kind in "iu" else 1.0)
     known = np.isfinite(values) & (values > 0)
     return np.where(known, values, 0).astype(np.float32) / np.float32(units)
-
-
-def read_pcd_points(path: Path, name: str = "points") -> np.ndarray:
-    """The known points ``(N, 3)`` of a PCD file, ASCII or binary, in the file's unit and frame.
-
-    Source: PCL's description of the format, version 0.7.
-    """
-    data, cure = path.read_bytes(), "Is it cut off, or another format?"
-    head = re.match(rb"[\s\S]{0,4000}?^DATA[ \t]+(\w+)[ \t]*\r?\n", data, re.MULTILINE)
-    if head is None:
-        bad_value(name, "a whole PCD file", path, cure)
-    lines = head.group().decode("ascii", errors="replace").splitlines()
-    entries = {words[0]: words[1:] for line in lines if (words := line.split()) and words[0][0] != "#"}
-    how = head.group(1).decode()
-    if how == "binary_compressed":
-        bad_value(name, "an uncompressed PCD file", path, "Run: pcl_convert_pcd_ascii_binary FILE out.pcd 1.")
-    try:
-        fields = entries["FIELDS"]
-        counts = [int(count) for count in entries.get("COUNT", ["1"] * len(fields))]
-        types = zip(entries["TYPE"], entries["SIZE"], strict=True)
-        kinds = [f"<{PCD_TYPES[kind]}{size}" for kind, size in types]
-        layout = np.dtype([(f, k, (n,)) for f, k, n in zip(fields, kinds, counts, strict=True)])
-        points, body = int(entries["POINTS"][0]), data[head.end() :]
-        if how == "binary":
-            rows = np.frombuffer(body, layout, points)
-            xyz = np.stack([rows[axis][:, 0] for axis in "xyz"], axis=1).astype(np.float64)
-        else:
-            starts = np.cumsum([0, *counts])[[fields.index(axis) for axis in "xyz"]]
-            xyz = np.array([line.split() for line in body.splitlines()[:points]], float)[:, starts]
-    except Exception:  # of any kind that a damaged file leads to
-        bad_value(name, "a whole PCD file with x, y and z", path, cure)
-    if len(xyz) != points:
-        bad_value(name, f"a PCD file with the {points} points of its head", f"{path} with {len(xyz)}", cure)
-    return xyz[np.isfinite(xyz).all(axis=1)]
 
 
 def read_las_points(path: Path, name: str = "points") -> np.ndarray:
@@ -118,6 +105,11 @@ def read_las_points(path: Path, name: str = "points") -> np.ndarray:
         bad_value(name, KINDS, path, cure)
     try:
         return np.array(laspy.read(path).xyz, np.float64)
+    except laspy.LaspyException as error:
+        if laspy.LazBackend.detect_available():
+            bad_value(name, "a whole LAS file", f"{path} ({error})", "Is it cut off?")
+        cure = "Run: pip install 'laspy[lazrs]', or convert it: pdal translate FILE out.ply."
+        bad_value(name, "a LAS file, or LAZ with laspy's lazrs", f"{path} ({error})", cure)
     except Exception as error:  # of any kind that a damaged file leads to
         bad_value(name, "a whole LAS file", f"{path} ({error})", "Is it cut off?")
 

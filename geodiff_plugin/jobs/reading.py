@@ -29,6 +29,7 @@ from geodiff_plugin.formats.images import (
     pages_of_both,
     warn_of_other_lens,
 )
+from geodiff_plugin.formats.jps import has_right_view_first
 from geodiff_plugin.formats.lenses import (
     distortion_from_text,
     undistorted,
@@ -196,7 +197,8 @@ def _filled_in(options: DepthOptions) -> tuple[Message, ...]:
 def _read_both(options: DepthOptions, as_stored: bool) -> list[np.ndarray]:
     """Both views of the one file that LEFT names."""
     if options.side_by_side:
-        return list(both_halves(_read_view(options.left, "LEFT", as_stored), "LEFT"))
+        halves = list(both_halves(_read_view(options.left, "LEFT", as_stored), "LEFT"))
+        return halves[::-1] if has_right_view_first(options.left, "LEFT") else halves
     pages = zip(pages_of_both(options.left, "LEFT"), ("LEFT", "RIGHT"), strict=True)
     left, right = (_read_view(options.left, name, as_stored, page) for page, name in pages)
     if left.shape != right.shape:

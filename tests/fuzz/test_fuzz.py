@@ -74,6 +74,17 @@ def image_bytes() -> dict[str, bytes]:
     }
 
 
+def _compressed_pcd(table: np.ndarray) -> bytes:
+    """PCL's compressed form, in which a run of literal bytes stands for itself."""
+    body = b"".join(table[:, axis].astype("<f4").tobytes() for axis in range(3))
+    runs = [body[start : start + 32] for start in range(0, len(body), 32)]
+    packed = b"".join(bytes([len(run) - 1]) + run for run in runs)
+    head = (
+        b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nPOINTS 12\nDATA binary_compressed\n"
+    )
+    return head + np.array([len(packed), len(body)], "<u4").tobytes() + packed
+
+
 def point_files() -> dict[str, bytes]:
     """A whole file of known depths of every kind, by suffix."""
     table = np.random.default_rng(0).uniform(0.5, 5, (12, 3))
@@ -91,6 +102,8 @@ def point_files() -> dict[str, bytes]:
             b"VERSION 0.7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\nPOINTS 12\nDATA binary\n"
             + table.tobytes()
         ),
+        ".PCD": _compressed_pcd(table),
+        ".dpt": b"PIEH" + np.array([3, 4], "<i4").tobytes() + table[:, 0].astype("<f4").tobytes(),
         ".pfm": b"Pf\n4 3\n-1.0\n" + table[:, 0].astype("<f4").tobytes(),
         ".png": image_bytes()["grey16.png"],
     }

@@ -260,9 +260,121 @@ def test_what_points_are_not_read_names_what_converts_them(tmp_path):
     (tmp_path / "000000.bin").write_bytes(bytes(160))
     with pytest.raises(ValueError, match="KITTI's velodyne.*calib_velo_to_cam"):
         read_points(tmp_path / "000000.bin")
-    (tmp_path / "c.pcd").write_bytes(PCD_HEAD.format("binary_compressed").encode())
-    with pytest.raises(ValueError, match="pcl_convert_pcd_ascii_binary"):
-        read_points(tmp_path / "c.pcd")
+    (tmp_path / "maps.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(90))
+    with pytest.raises(ValueError, match="an HDF5 or MATLAB file. Save its map as .npy"):
+        read_points(tmp_path / "maps.h5")
+
+
+def lzf(data: bytes) -> bytes:
+    """LZF by its description: copies of what came at most 8192 bytes before, and runs of literals between."""
+    packed, literals, at = bytearray(), bytearray(), 0
+
+    def flush() -> None:
+        for start in range(0, len(literals), 32):
+            run = literals[start : start + 32]
+            packed.extend(bytes([len(run) - 1]) + run)
+        literals.clear()
+
+    while at < len(data):
+        for length in (264, 40, 9, 8, 5, 3):  # with and without a byte of length
+            piece = data[at : at + length]
+            found = data.rfind(piece, max(0, at - 8192), at + length - 1) if len(piece) == length else -1
+            if 0 <= found < at:
+                break
+        else:
+            literals.append(data[at])
+            at += 1
+            continue
+        flush()
+        distance, code = at - found - 1, length - 2
+        head = min(code, 7) << 5 | distance >> 8
+        packed.extend([head, *([code - 7] if code >= 7 else []), distance & 0xFF])
+        at += length
+    flush()
+    return bytes(packed)
+
+
+def compressed_pcd(path: Path, points: np.ndarray) -> None:
+    """PCL's savePCDFileBinaryCompressed: one field after the other, with padding between them."""
+    head = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z _ rgb\nSIZE 4 4 4 1 4\nTYPE F F F U F\nCOUNT 1 1 1 4 1\n"
+        f"WIDTH {len(points)}\nHEIGHT 1\nPOINTS {len(points)}\nDATA binary_compressed\n"
+    )
+    body = b"".join(points[:, axis].astype("<f4").tobytes() for axis in range(3))
+    body += bytes(4 * len(points)) + np.full(len(points), 0.5, "<f4").tobytes()
+    packed = lzf(body)
+    assert len(packed) < len(body)
+    path.write_bytes(head.encode() + np.array([len(packed), len(body)], "<u4").tobytes() + packed)
+
+
+def test_compressed_points_of_pcl(tmp_path):
+    points = np.random.default_rng(5).integers(-300, 300, (500, 3)) / 64.0
+    points[40:200] = points[40]  # copies that overlap themselves
+    compressed_pcd(tmp_path / "c.pcd", points)
+    np.testing.assert_array_equal(read_points(tmp_path / "c.pcd"), points.astype(np.float32))
+    whole = (tmp_path / "c.pcd").read_bytes()
+    for damaged in (whole[:-20], whole.replace(b"POINTS 500", b"POINTS 499"), whole[:-400] + b"\xff" * 400):
+        (tmp_path / "d.pcd").write_bytes(damaged)
+        with pytest.raises(ValueError, match="whole PCD file"):
+            read_points(tmp_path / "d.pcd")
+
+
+def test_points_in_coordinates_of_a_map_are_refused(tmp_path):
+    survey = CLOUD + [431_200.0, 5_412_700.0, 340.0]
+    np.save(tmp_path / "survey.npy", survey)
+    with pytest.raises(ValueError, match="the frame of the left camera .* a map's. Move them there"):
+        read_points(tmp_path / "survey.npy")
+    np.save(tmp_path / "mm.npy", 1000 * CLOUD)
+    np.testing.assert_allclose(read_points(tmp_path / "mm.npy", scale=1000), CLOUD, atol=1e-4)
+
+
+def test_a_png_of_the_bytes_of_floats_is_a_map(tmp_path):
+    """As TartanAir V2 keeps depth: OpenCV writes blue, green, red, alpha of an array of float32."""
+    depth = np.random.default_rng(2).uniform(0.7, 90, (6, 9)).astype("<f4")
+    cv2.imwrite(str(tmp_path / "depth.png"), depth.view(np.uint8).reshape(6, 9, 4))
+    np.testing.assert_array_equal(read_points(tmp_path / "depth.png"), depth)
+    picture = np.random.default_rng(2).integers(0, 255, (6, 9, 4), np.uint8)
+    picture[..., 3] = 255
+    Image.fromarray(picture).save(tmp_path / "picture.png")
+    with pytest.raises(ValueError, match="16-bit grey PNG.*got .*RGBA"):
+        read_points(tmp_path / "picture.png")
+
+
+def test_depth_of_sintel(tmp_path):
+    depth = np.random.default_rng(2).uniform(0.7, 90, (5, 8)).astype("<f4")
+    head = np.array([202021.25], "<f4").tobytes() + np.array([8, 5], "<i4").tobytes()
+    (tmp_path / "frame.dpt").write_bytes(head + depth.tobytes())
+    np.testing.assert_array_equal(read_points(tmp_path / "frame.dpt"), depth)
+    for damaged in (head + depth.tobytes()[:-3], head[:9], b"PIEH" + bytes(80)):
+        (tmp_path / "frame.dpt").write_bytes(damaged)
+        with pytest.raises(ValueError, match="whole .dpt of MPI Sintel.*cut off"):
+            read_points(tmp_path / "frame.dpt")
+
+
+def test_a_colour_picture_in_exr_is_no_map(tmp_path):
+    openexr = pytest.importorskip("OpenEXR")
+    grey = np.random.default_rng(2).uniform(0.7, 9, (5, 8)).astype(np.float32)
+    head = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    for name, rgb in (("map", [grey] * 3), ("picture", [grey, 2 * grey, grey])):
+        with openexr.File(head, {"RGB": np.stack(rgb, axis=-1)}) as file:
+            file.write(str(tmp_path / f"{name}.exr"))
+    np.testing.assert_array_equal(read_points(tmp_path / "map.exr"), grey)
+    with pytest.raises(ValueError, match="a map of depths; got .*picture.exr, a colour picture"):
+        read_points(tmp_path / "picture.exr")
+
+
+def test_laz_without_its_decoder_names_it(tmp_path, monkeypatch):
+    laspy = pytest.importorskip("laspy")
+    las(tmp_path / "a.las")
+    monkeypatch.setattr(laspy.LazBackend, "detect_available", lambda: ())
+    (tmp_path / "a.laz").write_bytes((tmp_path / "a.las").read_bytes())
+
+    def without(path):
+        raise laspy.LaspyException("No LazBackend selected, cannot decompress data")
+
+    monkeypatch.setattr(laspy, "read", without)
+    with pytest.raises(ValueError, match="pip install 'laspy.lazrs.'"):
+        read_points(tmp_path / "a.laz")
 
 
 @pytest.mark.parametrize(("kind", "units"), [("float32", 1.0), ("uint16", 1000.0)])
