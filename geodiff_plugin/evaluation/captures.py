@@ -55,12 +55,12 @@ CAPTURE_NOTE = (
 FEWEST_SEEN = 100
 
 
-def f_score(points: np.ndarray, truth: np.ndarray, right_m: float = RIGHT_M) -> float:
-    """F-score of points ``(N, 3)``: within ``right_m`` of the truth's, and back (Tanks and Temples, S4)."""
+def f_score(points: np.ndarray, truth: np.ndarray) -> float:
+    """F-score of points ``(N, 3)``: within ``RIGHT_M`` of the truth's, and back (Tanks and Temples, S4)."""
     if not len(points) or not len(truth):
         return 0.0
     clouds = ((truth, points), (points, truth))
-    distances = (cKDTree(to).query(of, distance_upper_bound=right_m)[0] for to, of in clouds)
+    distances = (cKDTree(to).query(of, distance_upper_bound=RIGHT_M)[0] for to, of in clouds)
     accuracy, complete = (float((near < np.inf).mean()) for near in distances)
     return 2 * accuracy * complete / max(accuracy + complete, 1e-12)
 

@@ -135,9 +135,9 @@ def upright_size(path: PathLike, name: str) -> tuple[int, int]:
     return (height, width) if turned else (width, height)
 
 
-def is_turned(path: PathLike, name: str = "the image") -> bool:
+def is_turned(path: PathLike) -> bool:
     """Whether an image file is shown turned or mirrored, by its EXIF orientation."""
-    with open_image(path, name) as image:
+    with open_image(path, "the image") as image:
         return image.getexif().get(ORIENTATION) in TURNS
 
 

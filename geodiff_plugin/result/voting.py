@@ -245,14 +245,14 @@ def _weighed(votes: _Votes, shift: Tensor, error: Tensor) -> _Votes:
     return votes._replace(weight=votes.weight / (1.0 + apart) ** 2)
 
 
-def weighted_median(values: Tensor, weight: Tensor, rounds: int = ROUNDS) -> Tensor:
-    """Weighted median over the first axis, to within ``2**-rounds`` of the values' range, by bisection.
+def weighted_median(values: Tensor, weight: Tensor) -> Tensor:
+    """Weighted median over the first axis, to within ``2**-ROUNDS`` of the values' range, by bisection.
 
     Where all weights are 0, about the least value.
     """
     low, high, half = values.amin(0), values.amax(0), weight.sum(0) / 2.0
     counted = torch.empty_like(weight)
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         middle = 0.5 * (low + high)
         torch.le(values, middle, out=counted)  # in place, ten times as fast as torch.where
         reached = counted.mul_(weight).sum(0) >= half

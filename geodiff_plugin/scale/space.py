@@ -29,19 +29,20 @@ def _by_kernel(*tensors: Tensor) -> bool:
     return use_kernel(tensors[0]) and tensors[0].dtype == torch.float32 and not with_gradient
 
 
-def smooth_floor(x: Tensor, eps: float = FLOOR_EPS) -> Tensor:
+def smooth_floor(x: Tensor) -> Tensor:
     """Keep relative values ``x``, about [0, 1] but unbounded, above 0 with a gradient that is never zero.
 
-    ``(x + sqrt(x^2 + 4 eps^2)) / 2``, whose slope falls only as ``(eps / x)^2`` below 0, so that a clipped
-    pixel can still be pulled back (a softplus would underflow). Not in the paper; Eq. 13 needs ``D(z) >= 0``.
+    ``(x + sqrt(x^2 + 4 eps^2)) / 2``, with ``FLOOR_EPS`` for eps. Below 0 its slope falls only as ``(eps /
+    x)^2``, so that a clipped pixel can still be pulled back (a softplus would underflow). Not in the paper;
+    Eq. 13 needs ``D(z) >= 0``.
     """
-    if eps == FLOOR_EPS and _by_kernel(x):
+    if _by_kernel(x):
         from geodiff_plugin.scale import kernels
 
         return kernels.floored(x)
-    root = torch.sqrt(x * x + 4.0 * eps * eps)
+    root = torch.sqrt(x * x + 4.0 * FLOOR_EPS * FLOOR_EPS)
     # Below 0 the sum would cancel, and neighbouring values become equal in float32.
-    return torch.where(x > 0, 0.5 * (x + root), 2.0 * eps * eps / (root - x.clamp_max(0.0)))
+    return torch.where(x > 0, 0.5 * (x + root), 2.0 * FLOOR_EPS * FLOOR_EPS / (root - x.clamp_max(0.0)))
 
 
 def inverse_softplus(y: Tensor) -> Tensor:
