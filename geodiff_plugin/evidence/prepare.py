@@ -20,7 +20,7 @@ from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.inputs import Inputs
 from geodiff_plugin.matching import Matches, clean
 from geodiff_plugin.matching.matches import read_above
-from geodiff_plugin.matching.rows import RowMatches, match_rectified
+from geodiff_plugin.matching.rows import RowMatches, RowPictures, match_rows, rectified_pictures
 from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.pose.refine import refine_views, unchecked
@@ -76,19 +76,22 @@ def prepare_evidence(
     """
     needs_matches = config.needs_matches(points is not None)
     grid = matching.to_grid(native, config.sweep_pixels)
-    volume, matches, known_points = None, None, None
+    volume, matches, known_points, rows = None, None, None, None
     warnings: list[Message] = [] if pose is None else list(pose.warnings)
+    left_out = 0
+    if points is not None:
+        known_points, left_out = matching.points_to_matches(points, native.K_left, native.size, grid.size)
     if native.views and (config.search == "volume" or needs_matches):
+        pictures = pictures_beside(native) if needs_matches and config.crisp else None
         volume = matching.build_cost_volume(native, depth_range=config.depth_range, config=config)
         if needs_matches:
             matches = matching.match_volume(volume)
+            rows = None if pictures is None else rows_beside(pictures, matches, known_points)
         if matching.inverse_pose_preferred(native, matches):
             warnings.append(INVERSE)
-    if points is not None:
-        known_points, left_out = matching.points_to_matches(points, native.K_left, native.size, grid.size)
-        if left_out:
-            sentence = f"{left_out} points outside the left image are left out: is their frame right?"
-            warnings.append(Message("points.outside", sentence))
+    if left_out:
+        sentence = f"{left_out} points outside the left image are left out: is their frame right?"
+        warnings.append(Message("points.outside", sentence))
     evidence = Evidence(
         native,
         grid,
@@ -96,7 +99,7 @@ def prepare_evidence(
         matches,
         known_points,
         reliable=None if matches is None else reliable_matches(matches),
-        rows=rows_beside(native, matches, known_points) if config.crisp else None,
+        rows=rows,
         pose=pose,
         warnings=distinct(warnings),  # two checks may find the same mistake
     )
@@ -104,19 +107,27 @@ def prepare_evidence(
     return evidence
 
 
+def pictures_beside(native: PosedViews) -> Beside[RowPictures | None]:
+    """What the rows of a rectified pair are matched in, made by the CPU while a GPU matches on the grid."""
+    return Beside(lambda: rectified_pictures(native), native.left_01.device)
+
+
 def rows_beside(
-    native: PosedViews, matches: Matches | None, points: Matches | None
-) -> Beside[RowMatches | None] | None:
+    pictures: Beside[RowPictures | None], matches: Matches, points: Matches | None
+) -> Beside[RowMatches | None]:
     """The rows of a rectified pair, matched by the CPU while a GPU goes on: act 3 is the first to ask.
 
-    They are sought up to the nearest of the matches and known points.
+    They are sought up to the nearest of the matches and known points; ``None`` without such a pair.
     """
-    if matches is None:
-        return None
     nearest = matches.inverse_depth.amax()
     if points is not None:
         nearest = torch.maximum(nearest, points.inverse_depth.amax())
-    return Beside(lambda: match_rectified(native, nearest), native.left_01.device)
+
+    def matched() -> RowMatches | None:
+        pair = pictures.result()
+        return None if pair is None else match_rows(pair, pair.shift_px(float(nearest)))
+
+    return Beside(matched, matches.inverse_depth.device)
 
 
 def _read_back(evidence: Evidence) -> None:

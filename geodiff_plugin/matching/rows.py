@@ -12,11 +12,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin.geometry import image_size, is_rectified, resize_image, size_within, to_device_of
+from geodiff_plugin.geometry import image_size, is_rectified, resize_image, size_within
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import known_share
 from geodiff_plugin.matching.matches import Matches
-from geodiff_plugin.matching.uprights import certain_shear
+from geodiff_plugin.matching.uprights import certain_shear, upright_lines
 from geodiff_plugin.types import CameraView, PosedViews
 
 #: Parameters of OpenCV's matcher: keep what both views agree on, and drop speckles.
@@ -59,6 +59,22 @@ class RowMatches(NamedTuple):
     def certain(self) -> Tensor:
         """1 where the shift is matched, or that of the surface which goes on behind a nearer one, else 0."""
         return self.matched + self.hidden
+
+
+class RowPictures(NamedTuple):
+    """A rectified pair as its rows are matched; mirrored if its second view is on the left."""
+
+    left: np.ndarray  # (H, W) uint8, grey levels
+    right: np.ndarray
+    lines: np.ndarray  # (N, 4), ``upright_lines`` of the left one
+    infinity_px: float  # disparity of a point at infinity
+    focal_px: float  # of the left one, along the rows
+    shift_m: np.float32  # of left points into the right camera's frame, along the rows; above 0: mirrored
+    device: torch.device  # of the matches
+
+    def shift_px(self, inverse_depth: float) -> float:
+        """The shift of points at an inverse depth, 1/m."""
+        return inverse_depth * (self.focal_px * abs(float(self.shift_m)))
 
 
 def make_matcher(lowest: int, count: int, channels: int) -> Any:
@@ -131,24 +147,6 @@ def grid_of_rows(size: tuple[int, int]) -> tuple[int, int]:
     return size_within(size, MOST_PIXELS)
 
 
-def match_rectified(native: PosedViews, nearest: Tensor) -> RowMatches | None:
-    """Match the left image with the first view that is rectified with it and of its size, if there is one.
-
-    Args:
-        native: the image and its right views, at their own sizes.
-        nearest: ``()`` the largest inverse depth of the search, 1/m.
-    """
-    rectified = [v for v in native.views if is_rectified(native.K_left, v.K, v.T_right_from_left)]
-    view = next((v for v in rectified if image_size(v.image_01) == native.size), None)
-    if view is None:
-        return None
-    size = grid_of_rows(native.size)
-    left, K = resize_image(native.left_01.float(), native.K_left.float(), size)
-    right = CameraView(*resize_image(view.image_01.float(), view.K.float(), size), view.T_right_from_left)
-    focal_baseline = float(K[0, 0]) * abs(float(view.T_right_from_left[0, 3]))
-    return match_rows(left, right, K, float(nearest) * focal_baseline)
-
-
 def _row_shifts(
     left: np.ndarray, right: np.ndarray, infinity_px: float, nearest_px: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -165,27 +163,45 @@ def _row_shifts(
     return shift, (raw > 16 * (lowest - 1)) & (shift >= MIN_SHIFT_PX)
 
 
-def match_rows(left_01: Tensor, view: CameraView, K_left: Tensor, nearest_px: float) -> RowMatches:
-    """Match a rectified pair of one size, ``left_01 (3, H, W)`` in [0, 1] and ``view`` on either side.
+def rectified_pictures(native: PosedViews) -> RowPictures | None:
+    """The left image and the first view that is rectified with it and of its size, if there is one.
 
-    ``nearest_px`` is the largest shift of the search.
+    ``native`` are the image and its right views, at their own sizes.
     """
+    rectified = [v for v in native.views if is_rectified(native.K_left, v.K, v.T_right_from_left)]
+    view = next((v for v in rectified if image_size(v.image_01) == native.size), None)
+    if view is None:
+        return None
+    size = grid_of_rows(native.size)
+    left, K = resize_image(native.left_01.float(), native.K_left.float(), size)
+    right = CameraView(*resize_image(view.image_01.float(), view.K.float(), size), view.T_right_from_left)
+    return row_pictures(left, right, K)
+
+
+def row_pictures(left_01: Tensor, view: CameraView, K_left: Tensor) -> RowPictures:
+    """A rectified pair of one size, ``left_01 (3, H, W)`` in [0, 1] and ``view`` on either side."""
     levels = grey(torch.stack([left_01, view.image_01]))[:, 0] * 255.0
     images = list(levels.round().byte().cpu().numpy())
     K, K_right, T = (each.numpy(force=True) for each in (K_left, view.K, view.T_right_from_left))
     infinity = float(K[0, 2] - K_right[0, 2])
-    mirrored = T[0, 3] > 0
-    if mirrored:  # mirrored, a view to the left becomes one to the right
+    if T[0, 3] > 0:  # mirrored, a view to the left becomes one to the right
         images, infinity = [image[:, ::-1] for image in images], -infinity
-    shift, known = _row_shifts(images[0], images[1], infinity, nearest_px)
+    left, right = map(np.ascontiguousarray, images)
+    return RowPictures(left, right, upright_lines(left), infinity, float(K[0, 0]), T[0, 3], left_01.device)
+
+
+def match_rows(pictures: RowPictures, nearest_px: float) -> RowMatches:
+    """Match the rows of a pair; ``nearest_px`` is the largest shift of the search."""
+    shift, known = _row_shifts(pictures.left, pictures.right, pictures.infinity_px, nearest_px)
     hidden = hidden_gaps(shift, known)
     between = np.logical_or.accumulate(known, 1) & np.logical_or.accumulate(known[:, ::-1], 1)[:, ::-1]
     filled = between & ~known & ~hidden
-    shear = certain_shear(np.ascontiguousarray(images[0]), shift, known)
+    shear = certain_shear(pictures.lines, shift, known)
     shift = np.nan_to_num(fill_background(np.where(known, shift, np.float32(np.nan))))
     maps = np.stack([shift, known, hidden, filled])
-    shift_on, matched, hidden_on, filled_on = to_device_of(left_01, maps[..., ::-1] if mirrored else maps)
-    baseline_m = torch.tensor(abs(T[0, 3]), device="cpu")
+    maps = np.ascontiguousarray(maps[..., ::-1] if pictures.shift_m > 0 else maps)
+    shift_on, matched, hidden_on, filled_on = torch.from_numpy(maps).to(pictures.device)
+    baseline_m = torch.tensor(abs(pictures.shift_m), device="cpu")
     return RowMatches(shift_on, matched, hidden_on, filled_on, baseline_m, shear)
 
 

@@ -81,7 +81,7 @@ def _fit_lines(at: np.ndarray, values: np.ndarray, known: np.ndarray) -> _Fits:
     return _Fits(slope, middle, off, scale)
 
 
-def _upright_lines(grey: np.ndarray) -> np.ndarray:
+def upright_lines(grey: np.ndarray) -> np.ndarray:
     """Ends ``(N, 4)`` x, v, x, v of upright lines of a grey picture ``(H, W)`` uint8."""
     found = cv2.createLineSegmentDetector().detect(grey)[0]
     lines = np.zeros((0, 4)) if found is None else found.reshape(-1, 4).astype(np.float64)
@@ -113,7 +113,7 @@ def _along(lines: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> _Along:
     return _Along(rows.astype(float), of_line.astype(float), known, known.sum(1) / count[:, 0])
 
 
-def certain_shear(grey: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> float:
+def certain_shear(lines: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> float:
     """Pixels per row by which the right picture of a rectified pair is certainly sheared along its rows.
 
     It is the median of ``dd/dv - k d`` over upright lines, whose common ``k`` the left picture alone gives,
@@ -121,14 +121,13 @@ def certain_shear(grey: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> f
     ``dd/dv``: of the medians with and without it the one nearer to 0 counts.
 
     Args:
-        grey: ``(H, W)`` uint8, the left picture.
+        lines: ``(N, 4)``, ``upright_lines`` of the left picture ``(H, W)``.
         shift: ``(H, W)`` pixels from where a point would be at infinity, >= 0.
         matched: ``(H, W)``, above 0 where the shift is known.
 
     Returns:
         0 where nothing is certain, NaN where too few lines are matched.
     """
-    lines = _upright_lines(grey)
     if len(lines) < FEWEST_LINES:
         return math.nan
     along = _along(lines, shift, matched)
@@ -138,7 +137,7 @@ def certain_shear(grey: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> f
     lines, courses = lines[enough], _fit_lines(along.row[enough], along.shift[enough], along.known[enough])
     straight = courses.scale < MOST_SCATTER_PX
     x = (lines[straight, 0] + lines[straight, 2]) / 2
-    if straight.sum() < FEWEST_LINES or x.std() < LEAST_SPREAD * grey.shape[1]:
+    if straight.sum() < FEWEST_LINES or x.std() < LEAST_SPREAD * shift.shape[1]:
         return math.nan
     slopes = (lines[straight, 2] - lines[straight, 0]) / (lines[straight, 3] - lines[straight, 1])
     meeting = _fit_lines(x[None], slopes[None], np.ones((1, len(x)), bool))

@@ -27,7 +27,7 @@ from geodiff_plugin.algorithm.state import chunk_views
 from geodiff_plugin.algorithm.terms import Given, Objective, match_exposure, photometric, ssim
 from geodiff_plugin.config import DEFAULT, MARIGOLD_DC, PAPER, UpdatePlan
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.evidence.prepare import prepare_evidence, rows_beside
+from geodiff_plugin.evidence.prepare import pictures_beside, prepare_evidence, rows_beside
 from geodiff_plugin.formats.images import intrinsics_from_exif
 from geodiff_plugin.geometry import hidden_in_right, is_rectified, project, resize_image, warp_right_to_left
 from geodiff_plugin.matching import build_cost_volume, known_share, points_to_matches, with_points
@@ -398,7 +398,8 @@ def finished() -> dict[str, object]:
     for e in (0.03, 0.12):
         error = torch.full((1, 1, 1, 1), e)
         native = PosedViews(left, (*views, rectified), K)
-        evidence = Evidence(native, native, None, target, rows=rows_beside(native, target, None))
+        rows = rows_beside(pictures_beside(native), target, None)
+        evidence = Evidence(native, native, None, target, rows=rows)
         voted_m = vote_depth(depth_m, evidence, target, known_share(target), error)
         result[f"voted_{e}"] = (voted_m / depth_m).log()
     return result

@@ -18,10 +18,10 @@ from geodiff_plugin.algorithm.solver import FieldSystem, RobustField, solve_fiel
 from geodiff_plugin.algorithm.terms import Given, Loss
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.evidence.prepare import rows_beside
+from geodiff_plugin.evidence.prepare import pictures_beside, rows_beside
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import Matches, known_share, rows
-from geodiff_plugin.matching.rows import hidden_gaps, match_rows, with_hidden
+from geodiff_plugin.matching.rows import hidden_gaps, match_rows, row_pictures, with_hidden
 from geodiff_plugin.result import voting
 from geodiff_plugin.result.misfit import MATCH_NOISE_PX, expected_error
 from geodiff_plugin.result.voting import vote_depth
@@ -345,14 +345,14 @@ def scene(side: int = 1, doffs: float = 0.0) -> tuple[Tensor, Tensor, CameraView
 def voted(map_m: Tensor, left: Tensor, views, matched_m: Tensor, confidence: float, error=0.4, *spacing):
     target = Matches(1.0 / matched_m, torch.full_like(matched_m, confidence), torch.full((1,), 2e-3))
     native = PosedViews(left[0], tuple(views), CAMERA)
-    evidence = Evidence(native, native, None, target, rows=rows_beside(native, target, None))
+    evidence = Evidence(native, native, None, target, rows=rows_beside(pictures_beside(native), target, None))
     return vote_depth(map_m, evidence, target, known_share(target), torch.full((1, 1, 1, 1), error), *spacing)
 
 
 @pytest.mark.parametrize(("side", "doffs"), [(1, 0.0), (-1, 0.0), (1, 4.0), (-1, 4.0)])
 def test_rows_are_matched_whatever_side_and_principal_point_the_view_has(side, doffs):
     truth, left, view = scene(side, doffs)
-    found = match_rows(left[0], view, CAMERA, 9.0)
+    found = match_rows(row_pictures(left[0], view, CAMERA), 9.0)
     seen, gaps = found.matched > 0, found.filled > 0
     right = (found.shift - 18.0 / truth[0, 0]).abs()[seen] < 0.5
     assert seen.float().mean() > 0.6 and right.float().mean() > 0.9
@@ -373,7 +373,7 @@ def test_a_gap_is_hidden_where_it_is_no_wider_than_the_step_beside_it():
 @pytest.mark.parametrize("side", [1, -1])
 def test_the_strip_beside_a_near_surface_gets_the_depth_behind_it(side):
     truth, left, view = scene(side)
-    rows = match_rows(left[0], view, CAMERA, 9.0)
+    rows = match_rows(row_pictures(left[0], view, CAMERA), 9.0)
     assert (rows.hidden > 0).any() and not (rows.hidden * (rows.matched + rows.filled)).any()
     sure = (rows.matched * (18.0 / truth[0, 0] - rows.shift).abs().lt(0.5)).view_as(truth)
     matches = Matches(1.0 / truth, 0.9 * sure, torch.tensor([2e-3]))
@@ -388,7 +388,7 @@ def test_the_strip_beside_a_near_surface_gets_the_depth_behind_it(side):
 
 def test_a_map_of_another_size_takes_its_edges_from_the_same_rows():
     truth, left, view = scene()
-    found = match_rows(left[0], view, CAMERA, 9.0)
+    found = match_rows(row_pictures(left[0], view, CAMERA), 9.0)
     for factor in (0.5, 2.0):
         small_m = F.interpolate(truth, scale_factor=factor, mode="nearest-exact")
         resized = voting._rows_on(image_size(small_m), found)

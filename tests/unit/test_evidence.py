@@ -1,6 +1,7 @@
 """Evidence: what is known of a view on its grid, made once for one pair and one setting."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import ClassVar
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance
+from geodiff_plugin._threads import Beside
 from geodiff_plugin.algorithm.state import chunk_views
 from geodiff_plugin.algorithm.terms import Given, Objective
 from geodiff_plugin.config import KNOBS, GuidanceConfig
@@ -185,13 +187,14 @@ def test_every_knob_that_evidence_is_made_with_is_told_apart_by_the_store(made):
 
 @pytest.mark.parametrize(("of_match", "of_point"), [(0.5, 2.0), (2.0, 0.5), (2.0, None)])
 def test_rows_are_sought_up_to_the_nearest_of_matches_and_known_points(monkeypatch, of_match, of_point):
-    monkeypatch.setattr(prepare, "match_rectified", lambda native, nearest: nearest)
+    monkeypatch.setattr(prepare, "match_rows", lambda pictures, nearest_px: nearest_px)
     matches, points = (
         None
         if most is None
         else Matches(torch.tensor([[[[0.1, most]]]]), torch.ones(1, 1, 1, 2), torch.ones(1))
         for most in (of_match, of_point)
     )
-    left, given = pair()
-    assert rows_beside(given.beside(left), matches, points).result() == 2.0
-    assert rows_beside(given.beside(left), None, points) is None
+    pictures = SimpleNamespace(shift_px=lambda inverse_depth: 7.0 * inverse_depth)
+    here = torch.device("cpu")
+    assert rows_beside(Beside(lambda: pictures, here), matches, points).result() == 14.0
+    assert rows_beside(Beside(lambda: None, here), matches, points).result() is None

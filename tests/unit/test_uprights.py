@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin.matching.rows import match_rows
-from geodiff_plugin.matching.uprights import FEWEST_LINES, certain_shear
+from geodiff_plugin.matching.rows import match_rows, row_pictures
+from geodiff_plugin.matching.uprights import FEWEST_LINES, certain_shear, upright_lines
 from geodiff_plugin.types import CameraView
 
 HEIGHT, WIDTH = 240, 320
@@ -35,7 +35,8 @@ def bars(k: float, count: int = 14, seed: int = 0) -> tuple[np.ndarray, np.ndarr
 @pytest.mark.parametrize("shear", [-0.06, 0.03, 0.08])
 def test_a_shear_is_measured_and_a_pitch_of_the_cameras_only_hides_it(k, shear):
     grey, shift = bars(k)
-    found = certain_shear(grey, shift + shear * (ROWS - HEIGHT / 2)[:, None], np.ones_like(shift))
+    moved = shift + shear * (ROWS - HEIGHT / 2)[:, None]
+    found = certain_shear(upright_lines(grey), moved, np.ones_like(shift))
     assert found * shear >= 0 and abs(found) <= abs(shear) + 0.002
     if k == 0:
         assert found == pytest.approx(shear, abs=0.012)
@@ -46,7 +47,7 @@ def test_a_shear_is_measured_and_a_pitch_of_the_cameras_only_hides_it(k, shear):
 def test_a_right_picture_of_pitched_cameras_is_not_sheared(k, seed):
     grey, shift = bars(k, seed=seed)
     noisy = shift + np.random.default_rng(seed).normal(0, 0.3, shift.shape).astype(np.float32)
-    assert abs(certain_shear(grey, noisy, np.ones_like(shift))) < 0.003
+    assert abs(certain_shear(upright_lines(grey), noisy, np.ones_like(shift))) < 0.003
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -54,7 +55,7 @@ def test_lines_that_lean_each_its_own_way_show_no_shear(seed):
     """Poles in a heap: no common vanishing point in space, though each looks upright."""
     grey, shift = bars(0.0, seed=seed)
     own = np.random.default_rng(seed).normal(0, 0.08, WIDTH // 20)[np.arange(WIDTH) * (WIDTH // 20) // WIDTH]
-    assert abs(certain_shear(grey, shift + own * ROWS[:, None], np.ones_like(shift))) < 0.03
+    assert abs(certain_shear(upright_lines(grey), shift + own * ROWS[:, None], np.ones_like(shift))) < 0.03
 
 
 @pytest.mark.parametrize("others", [3, 4])
@@ -82,7 +83,7 @@ def test_few_lines_and_few_matches_say_nothing():
         (np.where(np.arange(WIDTH) < 60, grey, 120).astype(np.uint8), everywhere),
     )
     for picture, matched in nothing:
-        assert np.isnan(certain_shear(picture, shift, matched))
+        assert np.isnan(certain_shear(upright_lines(picture), shift, matched))
 
 
 @pytest.mark.parametrize("way", [1, -1])
@@ -99,5 +100,5 @@ def test_matched_rows_of_a_sheared_picture_say_so(way):
         left_01, right_01 = (
             torch.from_numpy(each / 255.0).float().expand(3, -1, -1) for each in (grey, right)
         )
-        found = match_rows(left_01, CameraView(right_01, K, T), K, 60.0).shear
+        found = match_rows(row_pictures(left_01, CameraView(right_01, K, T), K), 60.0).shear
         assert found == pytest.approx(shear, abs=0.01)
