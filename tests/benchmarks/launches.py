@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import argparse
 import functools
+import statistics
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -27,6 +29,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from triton.runtime.jit import KernelInterface
 
 from geodiff_plugin import _kernels
+from geodiff_plugin.bundled import load_bundled_prior
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.evidence.guidance import GeometryGuidance
@@ -35,7 +38,7 @@ from tests.benchmarks.cost import resized_pair
 from tests.benchmarks.measuring import holders
 from tests.benchmarks.random_marigold import random_marigold
 
-__all__ = ["Counted", "count_guided_call"]
+__all__ = ["Counted", "count_guided_call", "host_milliseconds"]
 
 #: Functions that choose between a kernel and its reference: pure functions of tensors.
 WITH_KERNELS = (
@@ -110,32 +113,29 @@ class Counted:
     launches: Counter[str] = field(default_factory=Counter)
 
 
-class _Counting(TorchDispatchMode):
-    """Counts the operations of this thread into the stage that runs."""
+class _Watching:
+    """Follows a call through its stages, networks and references apart."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.counted, self.stages, self._off = Counted(), [ELSEWHERE], 0
+        self.stages, self._off = [ELSEWHERE], 0
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if not self._off:
-            self.counted.operations[self.stages[-1]] += 1
-            self.counted.views[self.stages[-1]] += func.is_view
-        made = func(*args, **kwargs or {})
-        # What no kernel fills must be no index out of bounds.
-        return made.zero_() if "empty" in func.name() else made
+    def turns(self) -> None:
+        """Called before another stage begins or ends, or nothing is watched, or something is again."""
 
     @contextmanager
     def off(self) -> Iterator[None]:
-        """Count nothing within the block."""
+        """Watch nothing within the block."""
+        self.turns()
         self._off += 1
         try:
             yield
         finally:
+            self.turns()
             self._off -= 1
 
-    def uncounted(self, own: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, with nothing of it counted."""
+    def unwatched(self, own: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, with nothing of it watched."""
 
         @functools.wraps(own)
         def call(*args: Any, **kwargs: Any) -> Any:
@@ -149,26 +149,22 @@ class _Counting(TorchDispatchMode):
 
         @functools.wraps(own)
         def call(*args: Any, **kwargs: Any) -> Any:
+            self.turns()
             self.stages.append(stage)
             try:
                 return own(*args, **kwargs)
             finally:
+                self.turns()
                 self.stages.pop()
 
         return call
 
     def copied(self, own: Callable[..., Any]) -> Callable[..., Any]:
-        """A function that copies from the host to the device: one operation, where both are one."""
-
-        @functools.wraps(own)
-        def call(*args: Any, **kwargs: Any) -> Any:
-            self.counted.operations[self.stages[-1]] += not self._off
-            return own(*args, **kwargs)
-
-        return call
+        """A function that copies from the host to the device."""
+        return own
 
     def by_reference(self, own: Callable[..., Any]) -> Callable[..., Any]:
-        """The function counted with its kernels, whose launches change nothing; its reference's result."""
+        """The function watched with its kernels, whose launches change nothing; its reference's result."""
 
         @functools.wraps(own)
         def call(*args: Any, **kwargs: Any) -> Any:
@@ -181,6 +177,36 @@ class _Counting(TorchDispatchMode):
 
     def launch(self, kernel: Any, grid: Any) -> Callable[..., None]:
         """In place of ``kernel[grid]``."""
+        return lambda *args, **kwargs: None
+
+
+class _Counting(_Watching, TorchDispatchMode):
+    """Counts the operations of this thread into the stage that runs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counted = Counted()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if not self._off:
+            self.counted.operations[self.stages[-1]] += 1
+            self.counted.views[self.stages[-1]] += func.is_view
+        made = func(*args, **kwargs or {})
+        # What no kernel fills must be no index out of bounds.
+        return made.zero_() if "empty" in func.name() else made
+
+    def copied(self, own: Callable[..., Any]) -> Callable[..., Any]:
+        """One operation, also where host and device are one."""
+
+        @functools.wraps(own)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            self.counted.operations[self.stages[-1]] += not self._off
+            return own(*args, **kwargs)
+
+        return call
+
+    def launch(self, kernel: Any, grid: Any) -> Callable[..., None]:
+        """In place of ``kernel[grid]``: counts."""
 
         def counted(*args: Any, **kwargs: Any) -> None:
             if not self._off:
@@ -189,28 +215,66 @@ class _Counting(TorchDispatchMode):
         return counted
 
 
+class _Clocking(_Watching):
+    """Takes the time of this thread by the stage that runs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.milliseconds, self._since = Counter[str](), 0.0
+
+    def turns(self) -> None:
+        """Give the time since the last turn to the stage that ran."""
+        now = time.thread_time()
+        if not self._off:
+            self.milliseconds[self.stages[-1]] += 1e3 * (now - self._since)
+        self._since = now
+
+    def __enter__(self) -> None:
+        self._filled = ExitStack()
+        for owner, name in ((torch, "empty"), (torch, "empty_like"), (torch.Tensor, "new_empty")):
+            zeros = getattr(owner, name.replace("empty", "zeros"))
+            self._filled.enter_context(patch.object(owner, name, zeros))  # no index out of bounds
+        self._since = time.thread_time()
+
+    def __exit__(self, *error: object) -> None:
+        self.turns()
+        self._filled.close()
+
+
 @contextmanager
-def _as_on_cuda(counting: _Counting, pipe: Any) -> Iterator[None]:
-    """Stages take the way that they take on CUDA, and are counted."""
+def _as_on_cuda(watching: _Counting | _Clocking, pipe: Any) -> Iterator[None]:
+    """Stages take the way that they take on CUDA, and are watched."""
     with ExitStack() as stack:
 
         def put(owner: Any, name: str, value: Any) -> None:
             stack.enter_context(patch.object(owner, name, value))
 
         put(_kernels, "interpreting", lambda: True)
-        put(KernelInterface, "__getitem__", lambda kernel, grid: counting.launch(kernel, grid))
+        put(KernelInterface, "__getitem__", lambda kernel, grid: watching.launch(kernel, grid))
         for name in WITH_KERNELS:
             for owner, attribute, own in list(holders(name)):
-                put(owner, attribute, counting.by_reference(own))
+                put(owner, attribute, watching.by_reference(own))
         for owner, attribute, own in list(holders("to_device_of")):
-            put(owner, attribute, counting.copied(own))
+            put(owner, attribute, watching.copied(own))
         for name in STAGES:
             for owner, attribute, own in list(holders(name)):
-                put(owner, attribute, counting.within(name, own))
+                put(owner, attribute, watching.within(name, own))
         for network, method in ((pipe.unet, "forward"), (pipe.vae, "encode"), (pipe.vae, "decode")):
-            put(network, method, counting.uncounted(getattr(network, method)))
-        stack.enter_context(counting)
+            put(network, method, watching.unwatched(getattr(network, method)))
+        stack.enter_context(watching)
         yield
+
+
+def _guided_call(pipe: Any, side: int | None, **options: Any) -> Callable[[], object]:
+    """A guided call of the demo pair, resized to a longer side, by a pipeline with guidance enabled."""
+    pipe.set_progress_bar_config(disable=True)
+    pair = read_demo_pair()
+    left, right, cameras = pair.left, pair.right, (pair.rig.K_left, pair.rig.K_right)
+    if side is not None:
+        left, right, (*cameras,) = resized_pair(pair, side)
+    guidance = GeometryGuidance(right, tuple(cameras), pair.rig.E)
+    generator = torch.Generator("cpu")
+    return lambda: pipe(left, guidance=guidance, generator=generator.manual_seed(0), **options)
 
 
 def count_guided_call(resolution: int = 768, side: int | None = None) -> Counted:
@@ -220,30 +284,50 @@ def count_guided_call(resolution: int = 768, side: int | None = None) -> Counted
         resolution: longer side of what the prior works on, pixels.
         side: longer side of the photographs, pixels; ``None`` for the demo pair's own.
     """
-    pipe = enable_geometry_guidance(random_marigold(width=0.01))
-    pipe.set_progress_bar_config(disable=True)
-    pair, counting = read_demo_pair(), _Counting()
-    left, right, cameras = pair.left, pair.right, (pair.rig.K_left, pair.rig.K_right)
-    if side is not None:
-        left, right, (*cameras,) = resized_pair(pair, side)
-    options = {"processing_resolution": resolution, "num_inference_steps": 4}
-    guidance = GeometryGuidance(right, tuple(cameras), pair.rig.E)
+    pipe, counting = enable_geometry_guidance(random_marigold(width=0.01)), _Counting()
+    call = _guided_call(pipe, side, processing_resolution=resolution, num_inference_steps=4)
     with _as_on_cuda(counting, pipe):
-        pipe(left, guidance=guidance, generator=torch.Generator("cpu").manual_seed(0), **options)
+        call()
     return counting.counted
+
+
+def host_milliseconds(side: int = 160, repeats: int = 15) -> dict[str, float]:
+    """Median milliseconds of the host in a guided call of the bundled prior, by stage, without its networks.
+
+    They are those of one thread, which the machine's other work does not lengthen. On pictures this small
+    torch's operations take the time of their dispatch. What OpenCV does in threads of its own is not seen.
+    """
+    pipe = enable_geometry_guidance(load_bundled_prior())
+    call, taken = _guided_call(pipe, side), list[Counter[str]]()
+    for _ in range(repeats + 1):
+        clocking = _Clocking()
+        with _as_on_cuda(clocking, pipe):
+            call()
+        taken.append(clocking.milliseconds)
+    return {stage: statistics.median(each[stage] for each in taken[1:]) for stage in (*STAGES, ELSEWHERE)}
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--resolution", type=int, default=768, help="longer side of the map, pixels")
+    parser.add_argument("--host", action="store_true", help="the host's milliseconds instead, bundled prior")
     diffusers_logging.set_verbosity_error()
-    found = count_guided_call(parser.parse_args().resolution)
+    typed = parser.parse_args()
+    if typed.host:
+        torch.set_num_threads(1)
+        table = new_table(("stage", "ms"))
+        found = host_milliseconds()
+        for stage, milliseconds in (*found.items(), ("in all", sum(found.values()))):
+            table.add_row(stage, f"{milliseconds:.2f}")
+        show(table)
+        return
+    counted = count_guided_call(typed.resolution)
     table = new_table(("stage", "operations", "of them views", "Triton launches"))
+    parts = counted.operations, counted.views, counted.launches
     for stage in (*STAGES, ELSEWHERE):
-        table.add_row(stage, *(str(each[stage]) for each in (found.operations, found.views, found.launches)))
-    totals = (each.total() for each in (found.operations, found.views, found.launches))
-    table.add_row("in all", *map(str, totals))
+        table.add_row(stage, *(str(each[stage]) for each in parts))
+    table.add_row("in all", *(str(each.total()) for each in parts))
     show(table)
 
 

@@ -19,6 +19,15 @@ def test_a_guided_call_sends_few_operations():
     assert 10 < found.launches.total() <= MOST_LAUNCHES
 
 
+@pytest.mark.skipif(not has_triton(), reason="Triton is not installed")
+def test_the_hosts_time_is_that_of_all_stages():
+    from tests.benchmarks.launches import ELSEWHERE, STAGES, host_milliseconds
+
+    found = host_milliseconds(side=96, repeats=1)
+    assert list(found) == [*STAGES, ELSEWHERE]
+    assert min(found.values()) >= 0 and all(found[stage] > 0 for stage in ("match_volume", "finish", ELSEWHERE))
+
+
 def test_a_kernel_is_launched_on_the_device_of_its_tensor(monkeypatch):
     """Triton launches on the current device, which need not be that of the pipeline."""
     tensor, seen = torch.zeros(1), []
