@@ -25,7 +25,9 @@ def test_the_hosts_time_is_that_of_all_stages():
 
     found = host_milliseconds(side=96, repeats=1)
     assert list(found) == [*STAGES, ELSEWHERE]
-    assert min(found.values()) >= 0 and all(found[stage] > 0 for stage in ("match_volume", "finish", ELSEWHERE))
+    assert min(found.values()) >= 0 and all(
+        found[stage] > 0 for stage in ("match_volume", "finish", ELSEWHERE)
+    )
 
 
 def test_a_kernel_is_launched_on_the_device_of_its_tensor(monkeypatch):
