@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -52,15 +52,15 @@ class FiniteWatch:
         # The least and the largest value are finite if all are: one operation tells both.
         self._extremes.append(torch.stack(tensor.detach().float().aminmax()))
 
-    def check(self, dtype: torch.dtype) -> None:
-        """Raise ``InputError`` on the first tensor that was not finite; ``dtype`` is the prior's."""
+    def check(self, prior: Any) -> None:
+        """Raise ``InputError`` on the first tensor that was not finite, of a pipeline with a ``dtype``."""
         if not self._extremes:
             return
         finite = torch.stack(self._extremes).cpu().isfinite().all(1)
         if finite.all():
             return
         name, step = self._names[int((~finite).nonzero()[0])]
-        short = str(dtype).removeprefix("torch.")
+        short = str(prior.dtype).removeprefix("torch.")  # which a pipeline looks for in all of its layers
         cure = "Load the prior with dtype=torch.bfloat16 or torch.float32."
         if short != "float16":
             cure = "Are all weights of the prior finite?"

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import refuse
 from geodiff_plugin._kernels import use_kernel
-from geodiff_plugin.runtime.hooks import networks_of, replaced
+from geodiff_plugin.runtime.hooks import layers_of, networks_of, replaced, weights_of
 
 #: Sizes of which a network keeps a graph; calls of further ones run as always.
 MOST_SIZES = 8
@@ -75,11 +75,14 @@ class GraphedForward:
 
     def forget_if_changed(self) -> None:
         """Drop graphs that read other weights than the network now has, or run other layers."""
-        weights = tuple(weight.data_ptr() for weight in self._network.parameters())
-        layers = tuple((id(m), id(_processor_of(m))) for m in self._network.modules())
-        if (weights, layers) != self._made_of:
+        layers = layers_of(self._network)
+        made_of = (
+            [weight.data_ptr() for weight in weights_of(layers)],
+            [(id(layer), id(_processor_of(layer))) for layer in layers],
+        )
+        if made_of != self._made_of:
             self._graphs.clear()
-            self._made_of = weights, layers
+            self._made_of = made_of
 
     def call(self, forward: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """``forward(*args, **kwargs)``."""
@@ -165,7 +168,7 @@ class FasterNetworks:
             *(getattr(vae, side, None) for side in ("encoder", "decoder")),
         ]
         with ExitStack() as stack:
-            for norm in [] if vae is None else vae.modules():
+            for norm in [] if vae is None else layers_of(vae):
                 if type(norm) is torch.nn.GroupNorm:
                     faster = functools.partial(_fast_group_norm, norm, norm.forward)
                     stack.enter_context(replaced(norm, "forward", faster))

@@ -30,7 +30,7 @@ from geodiff_plugin.result.ensemble import ensemble_metric
 from geodiff_plugin.result.output import image_labels
 from geodiff_plugin.runtime.codec import MapCodec, ProcessingGrid, tiny_autoencoder
 from geodiff_plugin.runtime.graphs import FasterNetworks
-from geodiff_plugin.runtime.hooks import Exclusive, networks_of
+from geodiff_plugin.runtime.hooks import Exclusive, device_of, layers_of, networks_of
 from geodiff_plugin.runtime.noise_levels import check_scheduler
 from geodiff_plugin.runtime.run import GuidedRun, StepCallback
 
@@ -168,8 +168,10 @@ class GuidedCall(_Stock):
 
     @property
     def _execution_device(self) -> torch.device:
-        """As stock, which looks through all layers for it; while guided, where the run is."""
-        return super()._execution_device if self._guided_run is None else self._guided_run.device
+        """As stock, which looks through all layers several times; while guided, where the run is."""
+        if self._guided_run is not None:
+            return self._guided_run.device
+        return device_of(self) or super()._execution_device
 
     def progress_bar(self, iterable: Any = None, total: int | None = None, **kwargs: Any) -> Any:
         """Stock progress bars; while guided they are off, because the run shows one bar for all."""
@@ -279,8 +281,8 @@ def _check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) ->
     full = guidance.config.gradient == "full"
     for network in networks_of(pipe):
         differentiated = guidance.moves_latents and (full or network is getattr(pipe, "vae", None))
-        for module in network.modules():
-            _check_weights_stay(type(network).__name__, module, differentiated)
+        for layer in layers_of(network):
+            _check_weights_stay(type(network).__name__, layer, differentiated)
     if full and getattr(pipe, "_all_hooks", None):
         expected = "'denoised' with enable_model_cpu_offload()"
         cure = "Decoding pushes the U-Net to the CPU before its backward pass; use gradient='denoised' or "
@@ -292,7 +294,9 @@ def _check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) ->
 
 def _check_weights_stay(name: str, module: torch.nn.Module, differentiated: bool) -> None:
     """Refuse hooks that offload or cast weights before a backward pass needs them."""
-    registry, hook = (vars(module).get(name) for name in ("_diffusers_hook", "_hf_hook"))
+    registry, hook = vars(module).get("_diffusers_hook"), vars(module).get("_hf_hook")
+    if registry is None and hook is None:
+        return
     of_diffusers = "" if registry is None else " ".join(registry.hooks)
     of_accelerate = [h for h in getattr(hook, "hooks", [hook]) if type(h).__name__ == "AlignDevicesHook"]
     if any(h.offload for h in of_accelerate) or "group_offloading" in of_diffusers:

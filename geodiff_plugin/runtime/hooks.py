@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import functools
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
@@ -50,19 +50,49 @@ def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
 @contextmanager
 def frozen_weights(pipe: Any) -> Iterator[None]:
     """Switch ``requires_grad`` off for every weight of a pipeline, so that no graph is kept for them."""
-    flags = [(p, p.requires_grad) for module in networks_of(pipe) for p in module.parameters()]
-    for parameter, _ in flags:
-        parameter.requires_grad_(False)
+    weights = weights_of(layer for network in networks_of(pipe) for layer in layers_of(network))
+    thawed = [weight for weight in weights if weight.requires_grad]
+    for weight in thawed:
+        weight.requires_grad_(False)
     try:
         yield
     finally:
-        for parameter, flag in flags:
-            parameter.requires_grad_(flag)
+        for weight in thawed:
+            weight.requires_grad_(True)
 
 
 def networks_of(pipe: Any) -> list[torch.nn.Module]:
     """The components of a pipeline that have weights."""
     return [m for m in pipe.components.values() if isinstance(m, torch.nn.Module)]
+
+
+def layers_of(network: torch.nn.Module) -> list[torch.nn.Module]:
+    """What ``network.modules()`` gives, each once, in some order.
+
+    Its generators, nested as deep as the layers, take ten times as long: milliseconds in which a GPU waits.
+    """
+    found, queue = dict[int, torch.nn.Module](), [network]
+    while queue:
+        layer = queue.pop()
+        if id(layer) not in found:
+            found[id(layer)] = layer
+            queue += [part for part in layer._modules.values() if part is not None]
+    return list(found.values())
+
+
+def weights_of(layers: Iterable[torch.nn.Module]) -> list[torch.nn.Parameter]:
+    """The parameters of layers, each once."""
+    weights = (weight for layer in layers for weight in layer._parameters.values() if weight is not None)
+    return list({id(weight): weight for weight in weights}.values())
+
+
+def device_of(pipe: Any) -> torch.device | None:
+    """Where all weights of a pipeline lie; ``None`` if not in one place, or if hooks may move them."""
+    layers = [layer for network in networks_of(pipe) for layer in layers_of(network)]
+    if any("_hf_hook" in vars(layer) or "_diffusers_hook" in vars(layer) for layer in layers):
+        return None
+    devices = {weight.device for weight in weights_of(layers)}
+    return devices.pop() if len(devices) == 1 else None
 
 
 def images_in_float32(processor: Any, known: tuple[Any, Any] = (None, None)) -> AbstractContextManager[None]:

@@ -159,7 +159,7 @@ class GuidedRun:
         Once, after all has been asked of the device: reading it earlier would wait for the network.
         """
         for trajectory in self.trajectories:
-            trajectory.watch.check(self.pipe.dtype)
+            trajectory.watch.check(self.pipe)
 
     def begin(self, timesteps: Tensor) -> None:
         """Start the trajectory of the next chunk, with its timesteps on the CPU."""

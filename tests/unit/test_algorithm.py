@@ -1,6 +1,7 @@
 """Parts of the guided call: schedule, gradient rules, least-squares fields, correction, last stage."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -124,13 +125,13 @@ def test_a_gradient_of_any_size_passes_float16_and_comes_out_at_its_own(sizes):
 def test_the_first_that_is_not_finite_is_named_with_its_step_and_the_cure():
     watch = FiniteWatch()
     watch.note("the decoded map", 0, torch.ones(3))
-    watch.check(torch.float16)
+    watch.check(SimpleNamespace(dtype=torch.float16))
     watch.note("the encoded correction", 1, torch.tensor([1.0, torch.nan]))
     watch.note("the decoded map", 1, torch.tensor([torch.inf]))
     with pytest.raises(ValueError, match=r"encoded correction of denoising step 2 .* float16.*bfloat16"):
-        watch.check(torch.float16)
+        watch.check(SimpleNamespace(dtype=torch.float16))
     with pytest.raises(ValueError, match="weights"):
-        watch.check(torch.float32)
+        watch.check(SimpleNamespace(dtype=torch.float32))
 
 
 def test_a_power_of_two_above_is_the_one_of_the_exponent():
