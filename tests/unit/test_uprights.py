@@ -70,7 +70,8 @@ def test_a_tilted_board_among_few_other_lines_is_no_shear(others):
         at = (1 - 2 * (n % 2)) * (-130 - 8 * (n // 2) + 0.18 * (ROWS - HEIGHT / 2)[:, None]) + WIDTH / 2
         pole_here = np.abs(pole - at) < 2
         grey[pole_here], shift[pole_here] = 10, 12.0
-    assert not abs(certain_shear(cv2.GaussianBlur(grey, (0, 0), 0.7), shift, np.ones_like(shift))) > 0.003
+    lines = upright_lines(cv2.GaussianBlur(grey, (0, 0), 0.7))
+    assert not abs(certain_shear(lines, shift, np.ones_like(shift))) > 0.003
 
 
 def test_few_lines_and_few_matches_say_nothing():

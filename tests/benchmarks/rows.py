@@ -1,0 +1,126 @@
+"""Two matchers for the rows of rectified pairs, OpenCV's and the sweep's aggregation, against the truth.
+
+    python -m tests.benchmarks.rows DATA
+
+Data flow: rectified pairs with truth -> shifts of both, at the size at which rows are matched -> a table of
+    how many pixels each matches, and how many of these are wrong, with the CPU seconds of one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from geodiff_plugin.cli.terminal import new_table, show
+from geodiff_plugin.evaluation.datasets import StereoSample, find_pairs, load
+from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.evidence.inputs import left_images
+from geodiff_plugin.geometry import resize_image
+from geodiff_plugin.matching import match_volume, sweep_planes
+from geodiff_plugin.matching.census import grey
+from geodiff_plugin.matching.rows import RowPictures, grid_of_rows, match_rows, rectified_pictures
+from geodiff_plugin.types import CameraView, PosedViews
+
+__all__ = ["Score", "compare", "main"]
+
+#: Matches of the aggregation count from this confidence on, which is a probability.
+SURE = 0.5
+#: Wrong by more pixels than these.
+WRONG_PX = (1.0, 2.0)
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well a matcher does: shares of pixels with truth, of those that it matches, and CPU seconds."""
+
+    matched: float
+    wrong: tuple[float, ...]  # of the matched ones, by ``WRONG_PX``
+    seconds: float
+
+
+def _on_grid(sample: StereoSample) -> tuple[PosedViews, np.ndarray]:
+    """The views at the size at which rows are matched, and the true depth there, 0 where unknown."""
+    guidance = GeometryGuidance(sample.right, (sample.K_left, sample.K_right), sample.E)
+    native = guidance.inputs[0].beside(left_images(sample.left)[0])
+    size = grid_of_rows(native.size)
+    left_01, K = resize_image(native.left_01, native.K_left, size)
+    (view,) = native.views
+    right = CameraView(*resize_image(view.image_01, view.K, size), view.T_right_from_left)
+    depth_m = np.where(sample.valid, sample.depth_m, 0.0).astype(np.float32)
+    depth_m = cv2.resize(depth_m, size[::-1], interpolation=cv2.INTER_NEAREST)
+    return PosedViews(left_01, (right,), K), depth_m
+
+
+def _by_opencv(pictures: RowPictures, views: PosedViews, nearest_px: float) -> tuple[Tensor, Tensor]:
+    found = match_rows(pictures, nearest_px)
+    return found.shift, found.matched > 0
+
+
+def _by_aggregation(pictures: RowPictures, views: PosedViews, nearest_px: float) -> tuple[Tensor, Tensor]:
+    """Planes a pixel apart, from infinity to the nearest."""
+    per_px = 1.0 / pictures.shift_px(1.0)
+    planes = torch.arange(int(nearest_px) + 5, dtype=torch.float32) * per_px
+    greys = [grey(image[None])[0] for image in (views.left_01, views.views[0].image_01)]
+    posed = PosedViews(greys[0], (views.views[0]._replace(image_01=greys[1]),), views.K_left)
+    matches = match_volume(sweep_planes(posed, planes))
+    return matches.inverse_depth[0] / per_px, matches.confidence[0] > SURE
+
+
+#: Name -> matcher: shifts ``(H, W)`` in pixels, and where they are known.
+MATCHERS: dict[str, Callable[[RowPictures, PosedViews, float], tuple[Tensor, Tensor]]] = {
+    "OpenCV": _by_opencv,
+    "aggregation": _by_aggregation,
+}
+
+
+def compare(sample: StereoSample) -> dict[str, Score]:
+    """The scores of both matchers on a rectified pair with truth."""
+    views, depth_m = _on_grid(sample)
+    pictures = rectified_pictures(views)
+    assert pictures is not None
+    known = depth_m > 0
+    true_px = np.where(known, pictures.shift_px(1.0) / np.where(known, depth_m, 1.0), 0.0)
+    scores = {}
+    for name, matcher in MATCHERS.items():
+        started = time.process_time()
+        shift, matched = (each.numpy() for each in matcher(pictures, views, float(true_px.max())))
+        seconds = time.process_time() - started
+        off = np.abs(shift - true_px)[matched & known]
+        wrong = tuple(float((off > most).mean()) for most in WRONG_PX)
+        scores[name] = Score(float(matched[known].mean()), wrong, seconds)
+    return scores
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table; ``--help`` lists the options."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("data", type=Path, help="folder of data sets, as geodiff eval takes it")
+    typed = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    head = ("pair", "matcher", "matched", *(f"wrong by > {px:g} px" for px in WRONG_PX), "CPU s")
+    table, every = new_table(head), dict[str, list[Score]]()
+    for ref in find_pairs(typed.data):
+        sample = load(ref)
+        if not sample.rectified or sample.left.shape != sample.right.shape:
+            continue
+        for name, score in compare(sample).items():
+            every.setdefault(name, []).append(score)
+            cells = (score.matched, *score.wrong, score.seconds)
+            table.add_row(sample.label, name, *(f"{cell:.3f}" for cell in cells))
+    for name, scores in every.items():
+        means = np.mean([(score.matched, *score.wrong, score.seconds) for score in scores], axis=0)
+        table.add_row(f"mean of {len(scores)}", name, *(f"{mean:.3f}" for mean in means))
+    show(table)
+
+
+if __name__ == "__main__":
+    main()
