@@ -108,6 +108,9 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         slam.read_stella),
     "airslam": CalibrationFormat(
         "settings of AirSLAM (cam0, T_type)", r"^[ \t]+T_type[ \t]*:", slam.read_airslam),
+    "stvo": CalibrationFormat(
+        "settings of StVO-PL (cam0, cam_bl)", r"\A(?=[\s\S]*^cam0[ \t]*:)[\s\S]*^[ \t]+cam_bl[ \t]*:",
+        slam.read_stvo),
     "ros_ini": CalibrationFormat(
         ".ini of ROS' camera_calibration ([image], camera matrix)", r"^camera matrix[ \t]*$",
         robotics.read_ros_ini, (1, 2)),

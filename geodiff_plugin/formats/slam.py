@@ -1,17 +1,20 @@
-"""Calibrations in the settings of visual odometry and SLAM: OKVIS, SVO and maplab, stella_vslam, AirSLAM.
+"""Calibrations in the settings of visual odometry and SLAM: OKVIS, SVO, stella_vslam, AirSLAM, StVO-PL.
 
 Source: ``config/config_fpga_p2_euroc.yaml`` of ethz-asl/okvis and ``config/euroc.yaml`` of
 smartroboticslab/okvis2; ``svo_ros/param/calib/euroc_stereo.yaml`` of uzh-rpg/rpg_svo_pro_open;
-``example/euroc/EuRoC_stereo.yaml`` of stella-cv/stella_vslam; ``configs/camera`` of sair-lab/AirSLAM.
+``example/euroc/EuRoC_stereo.yaml`` of stella-cv/stella_vslam; ``configs/camera`` of sair-lab/AirSLAM;
+``config/dataset_params`` of rubengooj/stvo-pl.
 """
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.named import read_opencv
 from geodiff_plugin.formats.rigs import (
     Camera,
     CameraChoice,
@@ -113,3 +116,15 @@ def read_airslam(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         lens = entries["distortion_coeffs"][:count]
         cameras.append(Camera(intrinsics(*entries["intrinsics"]), size, lens, model))
     return make_rig(cameras[0], cameras[1], np.linalg.inv(poses[0]) @ poses[1])
+
+
+def read_stvo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """StVO-PL's and PL-SLAM's ``cam0``: both cameras and R, t, or one K of rectified images; metres."""
+    entries = read_yaml(texts[0])["cam0"]
+    size = entries["cam_width"], entries["cam_height"]
+    if "Kl" in entries:
+        return read_opencv((json.dumps(entries | {"image_size": size}),), choice)
+    K = intrinsics(*(entries[f"cam_{name}"] for name in ("fx", "fy", "cx", "cy")))
+    lens = [entries.get(f"cam_d{n}", 0.0) for n in range(4)]
+    camera = Camera(K, size, lens)
+    return make_rig(camera, camera, entries["cam_bl"], rectified=not any(lens))

@@ -37,7 +37,7 @@ PAIRS = ((0, 1), (2, 3))
 #: Folder names of the benchmarks: image_2 and image_02, and colored_0 of KITTI 2012.
 FOLDER = re.compile(r"(image|colored)_0?([0-3])(?!\d)")
 #: What the baseline is called, in metres.
-BASELINES = ("baseline_meters", "baseline_m", "baseline")
+BASELINES = ("baseline_meters", "baseline_m", "baseline", "bl")
 #: A frame of SceneFlow: its number, and a line for each camera.
 SCENEFLOW_FRAME = re.compile(
     r"^Frame[ \t]+(\d+)[ \t]*\r?\n[ \t]*L[ \t]+(.*)\n[ \t]*R[ \t]+(.*)$", re.MULTILINE
@@ -46,6 +46,8 @@ SCENEFLOW_FRAME = re.compile(
 SCENEFLOW_FOCAL_PX = {"35mm": 1050.0, "15mm": 450.0}
 SCENEFLOW_CENTRE = (479.5, 269.5)
 SCENEFLOW_SIZE = (960, 540)
+#: Numbers of a camera of DROID-SLAM with distortion.
+COUNT_OF_DROID = 8
 #: Metres between the cameras of Spring, which its files do not say.
 SPRING_BASELINE_M = 0.065
 #: What the names of its left images, or of their folder, contain.
@@ -75,6 +77,11 @@ def read_middlebury(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 def read_foundation_stereo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     """``K.txt``: nine numbers of K of both images, and the baseline in metres."""
     *K, baseline_m = texts[0].replace(",", " ").split()
+    if len(K) + 1 == COUNT_OF_DROID:
+        cure = "Give the measured distance of parallel cameras: --fx --fy --cx --cy --distortion --baseline."
+        bad_value(
+            "the file", "9 numbers of K and the baseline", "fx fy cx cy k1 k2 p1 p2 of one camera", cure
+        )
     if len(K) != 9:
         cure = "Add the baseline as a second line; a file that holds only K or E goes to K and E (--K, --E)."
         bad_value("the file", "9 numbers of K and the baseline in metres", f"{len(K) + 1} numbers", cure)

@@ -302,6 +302,26 @@ def airslam_fisheye(rig: Drawn) -> tuple[str, ...]:
     return airslam(rig, 2)
 
 
+def stvo(rig: Drawn) -> tuple[str, ...]:
+    """Four numbers a camera, and the pose as stereoCalibrate gives it."""
+    entries = {"Kl": rig.numbers(0), "Kr": rig.numbers(1), "Dl": rig.lenses[0], "Dr": rig.lenses[1]}
+    entries |= {"Rl": np.eye(3).ravel().tolist(), "Rr": np.eye(3).ravel().tolist(), "cam_bl": 0.12}
+    entries |= {"R": rig.T[:3, :3].ravel().tolist(), "t": rig.T[:3, 3].tolist(), "cam_model": "Pinhole"}
+    entries |= {"cam_width": rig.size[0], "cam_height": rig.size[1]}
+    return (yaml.safe_dump({"cam0": entries, "images_subfolder_l": "cam0/data/"}),)
+
+
+def stvo_rectified(rig: Drawn) -> tuple[str, ...]:
+    numbers = dict(zip(("cam_fx", "cam_fy", "cam_cx", "cam_cy"), rig.numbers(0), strict=True))
+    entries = (
+        numbers
+        | {"cam_bl": float(-rig.T[0, 3]), "cam_model": "Pinhole"}
+        | {f"cam_d{n}": 0.0 for n in range(4)}
+    )
+    entries |= {"cam_width": rig.size[0], "cam_height": rig.size[1]}
+    return (yaml.safe_dump({"cam0": entries}),)
+
+
 def anipose(rig: Drawn, fisheye: bool = False) -> tuple[str, ...]:
     text = ""
     for n, T in enumerate(rig.worlds):
@@ -557,13 +577,13 @@ ANY_POSE = (
     *(kalibr_fisheye, orb_slam_fisheye, kalibr_openvins, kalibr_cam_imu, basalt, basalt_fisheye),
     *(vins, vins_fisheye, matlab, matlab_pose, named, named_by_side),
     *(okvis, okvis_fisheye, svo, svo_inverse, svo_fisheye, airslam, airslam_fisheye),
-    *(anipose, anipose_fisheye, mrcal),
+    *(anipose, anipose_fisheye, mrcal, stvo),
 )
 RECTIFIED = (
     *(middlebury, middlebury_blanks, kitti_cam_to_cam, kitti_projections, booster, stereodemo, ros, ros_echo),
     *(opencv_projections, vkitti, argoverse, ros_ini, robotcar),
 )
-ONE_CAMERA = (stella, foundation_stereo, orb_slam_rectified, cityscapes, spring, sceneflow)
+ONE_CAMERA = (stella, stvo_rectified, foundation_stereo, orb_slam_rectified, cityscapes, spring, sceneflow)
 
 #: A rig of 0.12 m in every format, by the name of the function.
 K = np.array([[700.0, 0, 300], [0, 700.0, 200], [0, 0, 1]])

@@ -255,3 +255,16 @@ def test_a_rectifier_of_stella_describes_pictures_as_taken_too(tmp_path):
     fisheye = made | {"model": "fisheye", "D_left": LENS[:4], "D_right": LENS[:4]}
     taken = read_texts(tmp_path, yaml.safe_dump(content | {"StereoRectifier": fisheye})).as_taken
     assert [lens.model for lens in taken.distortion] == ["fisheye", "fisheye"]
+
+
+def test_eight_numbers_are_of_one_camera_of_droid_slam(tmp_path):
+    with pytest.raises(InputError, match="k1 k2 p1 p2 of one camera. Give .* --distortion --baseline"):
+        read_texts(tmp_path, "711.5 712.5 352.0 203.0 -0.28 0.07 0.0002 0.00002\n")
+
+
+def test_lines_of_mac_vo_name_the_baseline_bl(tmp_path):
+    text = (
+        "type: GeneralStereo\nargs:\n  camera:\n    fx: 735.5\n    fy: 734.5\n    cx: 642.5\n    cy: 362.25\n"
+    )
+    rig = read_texts(tmp_path, text + "  bl: 0.131    # Unit: meter\n  format: png\n")
+    assert rig.E[0, 3] == 0.131 and rig.K_left[1, 2] == 362.25
