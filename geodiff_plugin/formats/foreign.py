@@ -26,6 +26,11 @@ ONE_CAMERA = "It is of one camera: give the stereo calibration, or K and E of th
 SAVE_NPZ = "In Python: np.savez('calib.npz', K1=K1, D1=D1, K2=K2, D2=D2, R=R, T=T) of its matrices."
 FOREIGN_CALIBRATIONS = (
     ForeignCalibration(
+        r"<(?:imagelist|images)>\s*\"",
+        "a list of the calibration's pictures",
+        "Give what the calibration wrote: intrinsics.yml and extrinsics.yml of OpenCV's sample.",
+    ),
+    ForeignCalibration(
         r"\A\s*(RadTan|Pinhole|EquiDistant|KannalaBrandt|FOV|ATAN)[ \t]+[-+.\d]",
         "a camera.txt of DSO",
         ONE_CAMERA,

@@ -100,6 +100,8 @@ COUNTS = {
 }
 #: Those that two parallel cameras may share, and those of which one may be many.
 FOR_BOTH = ("M", "D")
+#: What files of single cameras say of both images.
+SHARED = ("imagesize", "imagewidth", "imageheight")
 #: A left camera of number 0.
 FROM_ZERO = re.compile(_of(WORDS["M"], 0, "zero"))
 #: Sizes and other numbers in a chessboard's name, whose unit is that of the translation.
@@ -195,7 +197,7 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 
     Lengths are in the unit that the file says, else they are taken as metres.
     """
-    read = [read_storage(text) for text in texts]
+    read = _with_sides([read_storage(text) for text in texts])
     arrays = [item for entries in read for item in entries.items() if isinstance(item[1], np.ndarray)]
     named = _named(arrays)
     sides = np.array([named[name].item() for name in SIDES if name in named])
@@ -225,6 +227,22 @@ def _with_taken(rig: Rig, named: Entries, size: Any) -> Rig:
     return rig
 
 
+def _with_sides(read: list[Entries]) -> list[Entries]:
+    """The entries of files, of two files of one camera each beside that of their pose with left and right."""
+    alone = [n for n, entries in enumerate(read) if any(_is_camera(key) for key in entries)]
+    if len(read) != 3 or len(alone) != 2:
+        return read
+    for n, side in zip(alone, ("left", "right"), strict=True):
+        read[n] = {
+            key if _squeezed(key) in SHARED else f"{side}.{key}": value for key, value in read[n].items()
+        }
+    return read
+
+
+def _is_camera(key: str) -> bool:
+    return bool(re.fullmatch(WORDS["M"], _squeezed(key)))
+
+
 def _is_posed(named: Entries) -> bool:
     return "E" in named and named["E"].size == 16 and "R" not in named  # of 9 it is the essential matrix
 
@@ -251,11 +269,9 @@ def _refuse_missing(named: Entries, arrays: Arrays) -> None:
     missing = [name for name in ("M1", "M2", *pose) if name not in named]
     if not missing:
         return
-    cure = "Where intrinsics and extrinsics are two files, give both; rename what has other names, "
-    cure += "or give K and E of the pair (--K, --K-right, --E)."
-    if {"M1", "M2"} <= set(missing) and (
-        "M" in named or any(re.fullmatch(WORDS["M"], _squeezed(k)) for k, _ in arrays)
-    ):
+    cure = "Where intrinsics and extrinsics are several files, give all (left, right, pose); rename what has "
+    cure += "other names, or give K and E of the pair (--K, --K-right, --E)."
+    if {"M1", "M2"} <= set(missing) and ("M" in named or any(_is_camera(key) for key, _ in arrays)):
         cure = "It is of one camera: give the stereo calibration, or K and E of the pair (--K, --E)."
     there = [f"{key} ({v.size})" for key, v in arrays if v.size in (3, 4, 5, 8, 9, 12, 14, 16)]
     others = f" among {', '.join(there[:MOST_LISTED])}" if there else ""

@@ -126,7 +126,7 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         r"\A(?![\s\S]*^LEFT\.P[ \t]*:)[\s\S]*^(?:Camera1?\.fx|Camera\.bf)[ \t]*:", robotics.read_orb_slam),
     "opencv": CalibrationFormat(
         "OpenCV YAML, XML or JSON (P1, P2, or M1, M2, R, T)",
-        r'!!opencv-matrix|<opencv_storage|"opencv-matrix"', named.read_opencv, (1, 2)),
+        r'!!opencv-matrix|<opencv_storage|"opencv-matrix"', named.read_opencv, (1, 2, 3)),
     "ros": CalibrationFormat(
         "pair of ROS camera_info (projection_matrix)",
         r"^(projection_matrix|distortion_model|rectification_matrix)\s*:", robotics.read_ros, (2,)),
@@ -139,7 +139,7 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     # Whatever JSON is left, and texts with a name of cameras: which names it lacks is the best to be said.
     "named": CalibrationFormat(
         "JSON, YAML, TOML or .npz of named matrices (K1, D1, K2, D2, R, T)",
-        rf"\A\s*\{{|{_NAME_OF_CAMERA}", named.read_opencv, (1, 2)),
+        rf"\A\s*\{{|{_NAME_OF_CAMERA}", named.read_opencv, (1, 2, 3)),
 }  # fmt: skip
 
 

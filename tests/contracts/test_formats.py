@@ -275,6 +275,7 @@ def test_sockets_of_an_oak_may_have_names(tmp_path):
         (b"\x93NUMPY\x01\0" + bytes(90), "Give it as --K or --E"),
         (b"PIEH" + bytes(90), "MPI Sintel"),
         (b"# oST version 5.0 parameters\n\n[image]\ncamera matrix\n", "Give left.ini and right.ini"),
+        (b'<?xml version="1.0"?>\n<opencv_storage>\n<imagelist>\n"l0.jpg"\n"r0.jpg"\n', "intrinsics.yml"),
         (b"RadTan 0.61 0.95 0.49 0.52 -0.28 0.07 0 0\n752 480\ncrop\n752 480\n", "camera.txt of DSO"),
         (b"Calibration results\n===\nCamera-system parameters:\n cam0\n", "Give the camchain.yaml"),
         (b'<?xml version="1.0"?>\n<calibration>\n  <projection>frame</projection>\n', "of one camera"),

@@ -268,3 +268,14 @@ def test_lines_of_mac_vo_name_the_baseline_bl(tmp_path):
     )
     rig = read_texts(tmp_path, text + "  bl: 0.131    # Unit: meter\n  format: png\n")
     assert rig.E[0, 3] == 0.131 and rig.K_left[1, 2] == 362.25
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+def test_left_right_and_pose_may_be_three_files(tmp_path, order):
+    def camera(K):
+        return {"camera_matrix": K, "distortion_coefficients": LENS, "image_width": 800, "image_height": 600}
+
+    files = [camera(LEFT), camera(RIGHT), {"R": R, "translation_mm": in_unit(1000)}]
+    rig = read_texts(tmp_path, *(yaml.safe_dump(files[n]) for n in order), distorted=True)
+    is_the_rig(rig)
+    assert rig.size_left == rig.size_right == (800, 600)
