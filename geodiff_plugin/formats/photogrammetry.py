@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.formats.files import parse_xml, read_text, stored_size
-from geodiff_plugin.formats.image_files import files_of, image_folders
+from geodiff_plugin.formats.image_files import IMAGE_FOLDERS, files_of, image_folders
 from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, pose_of, rigid
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
@@ -39,6 +39,8 @@ OPENSFM_LENSES = {
     "fisheye": ("fisheye", ("k1", "k2", "", "")),
     "fisheye_opencv": ("fisheye", ("k1", "k2", "k3", "k4")),
 }
+#: OpenSfM's folder of a model of undistorted images.
+UNDISTORTED = "undistorted"
 #: Names of the list of images that belongs to a file of Bundler.
 LISTS = ("list.txt", "pictures.txt", "bundle.out.list.txt", "prepare/list.txt", "list_tmp.txt")
 Entries = dict[str, Any]
@@ -171,8 +173,11 @@ def read_opensfm(path: Path, images_at: Path | None = None) -> Layout | None:
 def _opensfm(file: Path, data: list[Entries], images_at: Path | None) -> Layout:
     part = max(data, key=lambda each: len(each["shots"]))
     shots = sorted(part["shots"].items())
-    folders = image_folders(file.parent, file.parent.parent)
-    images = Images([name for name, _ in shots], folders, file, images_at)
+    # Beside a model of undistorted images; those of the same names above it are the distorted ones.
+    undistorted = file.parent.name == UNDISTORTED
+    folders = image_folders(file.parent, *(() if undistorted else (file.parent.parent,)))
+    distorted = IMAGE_FOLDERS if undistorted and images_at is None else ()
+    images = Images([name for name, _ in shots], folders, file, images_at, distorted)
 
     def build(frame: CaptureFrame, shot: Entries) -> Candidate:
         turn = Rotation.from_rotvec(array_of(shot["rotation"], (3,), "rotation"))

@@ -110,6 +110,21 @@ FOREIGN = (
         "a database of RTAB-Map",
         "Export images and the poses of the camera (RGB-D SLAM format) by rtabmap-export.",
     ),
+    ForeignFormat(
+        ("oxts",),
+        "the GPS of a drive of KITTI raw",
+        "Write its poses (pykitti's) as transforms.json, or give two images to geodiff depth with --calib.",
+    ),
+    ForeignFormat(
+        ("pose_intrinsic_imu.json",),
+        "poses of a phone of ScanNet++",
+        "Give the scene, whose dslr/ is read, or write these as transforms.json.",
+    ),
+    ForeignFormat(
+        ("scene_camera.json",),
+        "cameras of a BOP data set",
+        "Write its cam_R_w2c and cam_t_w2c, in millimetres, as transforms.json.",
+    ),
     ForeignFormat(("*.tfrecord",), "a recording of Waymo", "Write images and poses as transforms.json."),
     ForeignFormat(("*.hdf5", "*.h5"), "arrays in HDF5", "Write images and poses as transforms.json."),
     ForeignFormat(("*.traj",), "a trajectory of ARKitScenes", "Write it as transforms.json."),

@@ -11,6 +11,7 @@ from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.formats.captures import LAYOUTS, read_capture
 from geodiff_plugin.formats.lenses import undistorted_pixels
 from geodiff_plugin.formats.unknown import FOREIGN
+from geodiff_plugin.jobs.telling import say
 from tests.contracts import captures_of_fields, captures_of_sfm
 from tests.contracts.captures import (
     CENTRAL,
@@ -22,6 +23,7 @@ from tests.contracts.captures import (
     log,
     metashape,
     nvm,
+    opensfm,
     replica,
     scanner_app,
     stray,
@@ -29,8 +31,8 @@ from tests.contracts.captures import (
     three_rscan,
 )
 from tests.contracts.captures import WRITERS as OF_SETS
-from tests.contracts.captures_of_fields import llff, nerf_plus_plus, nerfies, neus, nsvf, splats
-from tests.contracts.captures_of_sfm import alicevision, openmvg
+from tests.contracts.captures_of_fields import llff, nerf_plus_plus, nerfies, neus, nsvf, sdfstudio, splats
+from tests.contracts.captures_of_sfm import alicevision, kapture, openmvg
 from tests.unit.capture_room import SIZE, K, render
 
 #: Where the order of the images is all that tells which pose is whose, and where they are a video.
@@ -354,3 +356,52 @@ def test_bundler_finds_its_list_where_its_script_keeps_it_or_asks_for_it(tmp_pat
     (twin.path / "prepare" / "list.txt").unlink()
     with pytest.raises(InputError, match="with its list of images.*a name a line"):
         opened(twin)
+
+
+#: The name of the second image in the file of a twin.
+SECOND = {
+    splats: ("cameras.json", "DSC_1"),
+    sdfstudio: ("meta_data.json", "000001_rgb.png"),
+    kapture: ("sensors/records_camera.txt", "walk one/001.png"),
+    openmvg: ("sfm_data_final.json", "M_1.png"),
+    alicevision: ("cameras.sfm", "D:/set/A_1.png"),
+}
+HOSTILE = (
+    *("../../../../../../etc/passwd", "/dev/zero", "a\0b.png", "x" * 5000, "a/" * 3000, "..", ""),
+    "\x1b[2J.png",
+)
+
+
+@pytest.mark.parametrize("write", SECOND, ids=lambda write: write.__name__)
+@pytest.mark.parametrize("name", HOSTILE, ids=[name[:6] for name in HOSTILE])
+def test_a_hostile_name_leaves_out_its_frame_alone(write, name, tmp_path, capsys):
+    twin = write(tmp_path / "scan")
+    file, second = twin.path / SECOND[write][0], SECOND[write][1]
+    typed = json.dumps(name)[1:-1] if file.suffix != ".txt" else name
+    text = file.read_text()
+    assert second in text
+    file.write_text(text.replace(second, typed, 1))
+    if "\0" in typed:  # no text
+        with pytest.raises(InputError, match="binary data"):
+            opened(twin)
+        return
+    capture = opened(twin)
+    assert len(capture) == 3
+    for frame, E in zip(capture.frames, np.delete(TRUE, 1, axis=0), strict=True):
+        np.testing.assert_allclose(frame.E, E, atol=1e-6)
+        assert frame.image.resolve().is_relative_to((tmp_path / "scan").resolve())
+    for note in capture.notes:
+        say(note)
+    assert all(line.isprintable() and len(line) < 1000 for line in capsys.readouterr().err.splitlines())
+
+
+def test_distorted_images_do_not_stand_in_for_the_undistorted_ones_of_opensfm(tmp_path):
+    folder = opensfm(tmp_path / "scan").path
+    (folder / "undistorted").mkdir()
+    shutil.copytree(folder / "images", folder / "undistorted" / "images")
+    shutil.copy(folder / "reconstruction.json", folder / "undistorted")
+    frames = Capture.open(folder / "undistorted").frames
+    assert {frame.image.parent for frame in frames} == {folder / "undistorted" / "images"}
+    shutil.rmtree(folder / "undistorted" / "images")
+    with pytest.raises(InputError, match="no image file"):
+        Capture.open(folder / "undistorted")
