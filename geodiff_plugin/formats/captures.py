@@ -46,6 +46,7 @@ from geodiff_plugin.formats.radiance import (
     read_sdfstudio,
     read_splat_cameras,
 )
+from geodiff_plugin.formats.realityscan import read_realityscan
 from geodiff_plugin.formats.rigs import RATIO_TOLERANCE, Camera, lens_of, reading_whole, resized
 from geodiff_plugin.formats.sequences import (
     read_photographs,
@@ -101,6 +102,7 @@ LAYOUTS = (
     CaptureFormat("kapture", ("**/sensors.txt", "**/records_camera.txt"), read_kapture, names_images=True),
     CaptureFormat("OpenMVG", ("sfm_data*.json",), read_openmvg, names_images=True),
     CaptureFormat("Meshroom", ("*.sfm",), read_alicevision, names_images=True),
+    CaptureFormat("RealityScan", ("*.xmp",), read_realityscan),
     CaptureFormat("Metashape", ("*.xml",), read_metashape, names_images=True),
     CaptureFormat("OpenSfM", ("*reconstruction*.json",), read_opensfm, names_images=True),
     CaptureFormat("Bundler", ("*.out", "list*.txt"), read_bundler, names_images=True),

@@ -66,7 +66,6 @@ FOREIGN = (
     ForeignFormat(("*.svo", "*.svo2"), "a recording of ZED", "Export it as a video with ZED_SVO_Editor."),
     ForeignFormat(("*.rcproj",), "a project of RealityCapture", COLMAP_EXPORT),
     ForeignFormat(("*.csv",), "cameras of RealityCapture", COLMAP_EXPORT, r"\A#(name,x,y|cameras \d)"),
-    ForeignFormat(("*.xmp",), "a camera of RealityCapture", COLMAP_EXPORT, r"xcr:Rotation|capturingreality"),
     ForeignFormat(
         ("*.xml",),
         "a block of ContextCapture (BlocksExchange)",

@@ -1,4 +1,4 @@
-"""The walk of ``captures`` as kapture, OpenMVG and AliceVision write it."""
+"""The walk of ``captures`` as kapture, OpenMVG, AliceVision and RealityScan write it."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.contracts.captures import TRUE, Twin, pictures, quaternion
+from tests.contracts.captures import TRUE, Twin, pictures, quaternion, words
 from tests.unit.capture_room import SIZE, K
 
 #: OpenMVG has one focal length.
@@ -88,4 +88,22 @@ def alicevision(folder: Path) -> Twin:
     return Twin(folder, unit=None, file="cameras.sfm")
 
 
-WRITERS = (kapture, openmvg, alicevision)
+def realityscan(folder: Path) -> Twin:
+    """A sidecar beside each image, its numbers as attributes and as elements."""
+    pictures(folder, [f"R_{i}.png" for i in range(4)], ROUND)
+    longer = max(SIZE)
+    u, v = ((ROUND[i, 2] + 0.5 - SIZE[i] / 2) / longer for i in range(2))
+    for i, E in enumerate(TRUE):
+        (folder / f"R_{i}.xmp").write_text(
+            '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+            '<rdf:Description xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#" xcr:Version="3" '
+            f'xcr:DistortionModel="perspective" xcr:FocalLength35mm="{200.0 / longer * 36}" xcr:Skew="0" '
+            f'xcr:AspectRatio="1" xcr:PrincipalPointU="{u}" xcr:PrincipalPointV="{v}">'
+            f"<xcr:Rotation>{words(E[:3, :3].T)}</xcr:Rotation><xcr:Position>{words(E[:3, 3])}</xcr:Position>"
+            "<xcr:DistortionCoeficients>0 0 0 0 0 0</xcr:DistortionCoeficients>"
+            "</rdf:Description></rdf:RDF></x:xmpmeta>"
+        )
+    return Twin(folder, ROUND, unit=None, file="R_2.xmp")
+
+
+WRITERS = (kapture, openmvg, alicevision, realityscan)

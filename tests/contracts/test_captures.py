@@ -32,7 +32,7 @@ from tests.contracts.captures import (
 )
 from tests.contracts.captures import WRITERS as OF_SETS
 from tests.contracts.captures_of_fields import llff, nerf_plus_plus, nerfies, neus, nsvf, sdfstudio, splats
-from tests.contracts.captures_of_sfm import alicevision, kapture, openmvg
+from tests.contracts.captures_of_sfm import alicevision, kapture, openmvg, realityscan
 from tests.unit.capture_room import SIZE, K, render
 
 #: Where the order of the images is all that tells which pose is whose, and where they are a video.
@@ -154,7 +154,6 @@ def test_what_has_cameras_but_no_poses_says_so(tmp_path):
 #: The beginning of a file of formats that a name alone does not tell.
 CONTENTS = {
     "cameras of RealityCapture": "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n",
-    "a camera of RealityCapture": "<x:xmpmeta><rdf:Description><xcr:Rotation>1 0 0</xcr:Rotation>",
     "a block of ContextCapture (BlocksExchange)": '<?xml version="1.0"?>\n<BlocksExchange version="3.2">',
     "a trajectory of Open3D": '{"class_name": "PinholeCameraTrajectory", "parameters": []}',
     "cameras of Virtual KITTI": "frame cameraID r1,1 r1,2 r1,3 t1\n",
@@ -405,3 +404,33 @@ def test_distorted_images_do_not_stand_in_for_the_undistorted_ones_of_opensfm(tm
     shutil.rmtree(folder / "undistorted" / "images")
     with pytest.raises(InputError, match="no image file"):
         Capture.open(folder / "undistorted")
+
+
+def test_realityscan_counts_tangential_coefficients_the_other_way_round(tmp_path):
+    """x' = x (1 + k1 r2 + ...) + t1 (r2 + 2 x2) + 2 t2 x y, of its description: t2, t1 are p1, p2."""
+    twin = realityscan(tmp_path / "scan")
+    for file in twin.path.glob("*.xmp"):
+        text = file.read_text().replace("perspective", "brown3t2")
+        file.write_text(text.replace(">0 0 0 0 0 0<", ">0.1 -0.02 0.03 0 -0.02 0.01<"))
+    frame = opened(twin).frames[0]
+    x, y = np.random.default_rng(0).uniform(-0.4, 0.4, (2, 40))
+    focal, centre = np.diag(frame.K)[:2], frame.K[:2, 2]
+    taken = bent(x, y, (0.1, -0.02, 0.03), p1=0.01, p2=-0.02) * focal + centre
+    straight = np.stack([x, y], axis=1) * focal + centre
+    np.testing.assert_allclose(undistorted_pixels(taken, frame.K, frame.lens), straight, atol=0.01)
+    for file in twin.path.glob("*.xmp"):
+        file.write_text(file.read_text().replace("brown3t2", "division"))
+    with pytest.raises(InputError, match="a lens of RealityScan.*undistorted images"):
+        opened(twin)
+
+
+def test_other_sidecars_are_no_poses_and_the_largest_component_is_taken(tmp_path):
+    twin = realityscan(tmp_path / "scan")
+    files = sorted(twin.path.glob("*.xmp"))
+    files[0].write_text(files[0].read_text().replace('xcr:Skew="0"', 'xcr:Skew="0" xcr:ComponentId="{B}"'))
+    capture = opened(twin)
+    assert len(capture) == 3 and [note.code for note in capture.notes] == ["capture.part"]
+    np.testing.assert_allclose(capture.frames[0].E, TRUE[1], atol=1e-6)
+    for file in files:
+        file.write_text('<x:xmpmeta xmlns:x="adobe:ns:meta/"></x:xmpmeta>')
+    assert read_capture(twin.path, fov=60.0)[1] == "images without poses"
