@@ -9,6 +9,7 @@ colmap/colmap.
 
 from __future__ import annotations
 
+import os
 import re
 import struct
 from collections.abc import Iterable, Iterator, Sequence
@@ -92,6 +93,7 @@ PLACES = (
     ("sparse/*", "sparse"),
     ("[0-9]*",),
     ("colmap/sparse/*", "colmap/sparse", "colmap"),
+    ("colmap_text", "colmap_sparse/*"),
     ("dense/sparse", "dense/*/sparse"),
     ("distorted/sparse/*",),
 )
@@ -279,15 +281,16 @@ def read_colmap(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     return make_rig(cameras[0], cameras[1], left.T @ np.linalg.inv(right.T))
 
 
-def _models_below(path: Path) -> list[Files]:
-    """The models of the first of ``PLACES`` that has any."""
+def _models_below(path: Path) -> Iterator[list[Files]]:
+    """The models of each of ``PLACES`` that has any."""
     if path.is_file():
-        return [files] if path.stem in ("cameras", "images") and (files := model_files(path.parent)) else []
+        if path.stem in ("cameras", "images") and (files := model_files(path.parent)):
+            yield [files]
+        return
     for place in PLACES:
         folders = sorted(at for pattern in place for at in ([path] if not pattern else path.glob(pattern)))
         if models := [files for files in map(model_files, folders) if files]:
-            return models
-    return []
+            yield models
 
 
 def _largest(models: Iterable[Files], project: Path) -> tuple[Files, Model, tuple[Message, ...]]:
@@ -315,10 +318,21 @@ def _around(folder: Path, project: Path) -> list[Path]:
 
 
 def read_colmap_capture(path: Path, images_at: Path | None = None) -> Layout | None:
-    """A model (text or binary), or the project that holds one; its images may be given by their folder."""
-    models = _models_below(path)
-    if not models:
-        return None
+    """A model (text or binary), or the project that holds one; its images may be given by their folder.
+
+    That of the first place whose images are there, such as the undistorted ones alone.
+    """
+    passed_over: list[Layout] = []
+    for models in _models_below(path):
+        layout = _capture_of(models, path, images_at)
+        if any(os.path.isfile(each.frame.image) for each in layout.candidates):
+            return layout
+        passed_over.append(layout)
+    return passed_over[0] if passed_over else None
+
+
+def _capture_of(models: Iterable[Files], path: Path, images_at: Path | None) -> Layout:
+    """The largest of the models of one place."""
     files, model, notes = _largest(models, path)
     folder = files[0].parent
     try:

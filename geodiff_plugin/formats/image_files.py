@@ -29,13 +29,15 @@ NO_PHOTOGRAPHS = ("depth", "mask", "normal", "seg", "label", "conf", "thumb", ".
 OTHER_CAMERAS = (
     *("sparse", "transforms.json", "transforms_train.json", "cameras.txt", "cameras.bin", "cameras.xml"),
     *("reconstruction.json", "bundle.out", "metadata.json", "keyframes", "odometry.csv", "groundtruth.txt"),
-    *("traj.txt", "poses.txt", "calib.txt", "cam0", "report.json"),
+    *("traj.txt", "poses.txt", "calib.txt", "cam0", "report.json", "cameras.json", "meta_data.json"),
+    *("poses_bounds.npy", "cameras_sphere.npz", "sfm_data.json", "cameras.sfm", "records_camera.txt"),
 )
 
 
 def images_of(paths: Iterable[Path]) -> list[Path]:
-    """The images among paths, numbers in names in order."""
-    return sorted((path for path in paths if path.suffix.lower() in IMAGES), key=natural_order)
+    """The images among paths, numbers in names in order; none of the hidden files that macOS leaves."""
+    images = (path for path in paths if path.suffix.lower() in IMAGES and not path.name.startswith("."))
+    return sorted(images, key=natural_order)
 
 
 def images_in(folder: Path) -> list[Path]:

@@ -666,3 +666,26 @@ def test_four_numbers_beside_a_sequence_are_its_camera(tmp_path):
     (folder / "K.txt").unlink()
     (folder / "calibration.txt").write_text(f"{K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]}\n")
     np.testing.assert_allclose(Capture.open(folder).frames[0].K, K)
+
+
+def test_a_project_that_kept_its_undistorted_images_alone_is_read_by_their_model(tmp_path):
+    folder = colmap_text(tmp_path / "scan")
+    (folder / "dense" / "0").mkdir(parents=True)
+    shutil.copytree(folder / "sparse" / "0", folder / "dense" / "0" / "sparse")
+    cameras = folder / "sparse" / "0" / "cameras.txt"
+    cameras.write_text(cameras.read_text().replace("PINHOLE", "OPENCV").replace("91.5\n", "91.5 0.1 0 0 0\n"))
+    assert Capture.open(folder).frames[0].lens is not None
+    (folder / "images").rename(folder / "dense" / "0" / "images")
+    capture = Capture.open(folder)
+    assert len(capture) == 4 and all(frame.lens is None for frame in capture.frames)
+    shutil.rmtree(folder / "dense" / "0" / "images")
+    with pytest.raises(InputError, match="no image file in sparse/0"):
+        Capture.open(folder)
+
+
+def test_hidden_files_that_macos_leaves_beside_images_are_none(tmp_path):
+    folder = seven_scenes(tmp_path / "scan")
+    for image in list(folder.glob("*.color.png")):
+        image.with_name(f"._{image.name}").write_bytes(b"Mac OS X")
+    capture = Capture.open(folder)
+    assert len(capture) == 4 and "capture.skipped" not in [note.code for note in capture.notes]
