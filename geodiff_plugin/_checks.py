@@ -46,8 +46,9 @@ def bad_value(
 
 
 def bad_type(name: str, expected: str, got: object, cure: str = "") -> NoReturn:
-    """Raise ``InputTypeError`` with the same sentence, naming the type of the value."""
-    bad_value(name, expected, type(got).__name__, cure, InputTypeError)
+    """Raise ``InputTypeError`` with the same sentence: of a text what it says, of others the type."""
+    kind = f"the text {got!r}" if isinstance(got, str) else type(got).__name__
+    bad_value(name, expected, kind, cure, InputTypeError)
 
 
 def refuse(sentences: str) -> NoReturn:

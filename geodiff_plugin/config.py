@@ -367,8 +367,8 @@ PRESETS = {
 def close_names(name: str, names: Iterable[str]) -> str:
     """Names that exist, those that look like ``name`` first, as a sentence."""
     names = list(names)
-    near = difflib.get_close_matches(name, names, 3, 0.6)
-    hint = f"Did you mean {' or '.join(near)}? " if near else ""
+    *others, last = difflib.get_close_matches(name, names, 3, 0.6) or [""]
+    hint = f"Did you mean {', '.join(others)}{' or ' * bool(others)}{last}? " if last else ""
     return f"{hint}There are: {', '.join(names)}."
 
 

@@ -3,6 +3,7 @@
 The process of pytest-xdist that hands out tests loads this file too, and would wait for torch in vain.
 """
 
+import gc
 import os
 from pathlib import Path
 
@@ -11,6 +12,14 @@ import pytest
 # Networks and images are tiny here: a second thread costs more than it brings, above all where several
 # processes share the cores. Torch reads this when it is imported, also in processes that a test starts.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Half a million objects of torch and its relatives stay to the end. The collector would look through them
+# while they are imported and then again in every test.
+gc.disable()
+
+
+def pytest_collection_finish():
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -126,8 +126,12 @@ class _Video:
     )
     out: Path = _out(Path("depth.webp"), "The video: .mp4, .webp or .gif.", "--out", "-o")
     fps: float = declare(10.0, "Frames per second.")
-    near: float | None = declare(None, "Depth of the last colour, in metres (default: the maps' own).")
-    far: float | None = declare(None, "Depth of the first colour, in metres (default: the maps' own).")
+    near: float | None = declare(
+        None, "Near end of the colours, in metres (default: the nearest depth of the maps)."
+    )
+    far: float | None = declare(
+        None, "Far end of the colours, in metres (default: the farthest depth of the maps)."
+    )
     overwrite: bool = _out(False, "Replace an existing file.")
 
 
@@ -141,7 +145,7 @@ class _Submit:
 
 @dataclass(frozen=True, kw_only=True)
 class _Merge:
-    folder: Path = declare(MISSING, "The --out of geodiff depth --shard.", "", metavar="DIR")
+    folder: Path = declare(MISSING, "Folder that geodiff depth --shard wrote to.", "", metavar="DIR")
     json: bool = _out(False, "Print the rows as JSON instead of the table.")
 
 
@@ -190,8 +194,14 @@ COMMANDS = {
         "Measure how much time guidance adds.",
     ),
     "video": Command(_Video, _later("cli.results.run_video"), "Join the depth maps of frames into a video."),
-    "merge": Command(_Merge, _later("cli.results.run_merge"), "Join the tables of shards of many pairs."),
-    "submit": Command(_Submit, _later("cli.results.run_submit"), "Write results for Middlebury or ETH3D."),
+    "merge": Command(
+        _Merge, _later("cli.results.run_merge"), "Join the tables that geodiff depth --shard wrote."
+    ),
+    "submit": Command(
+        _Submit,
+        _later("cli.results.run_submit"),
+        "Write results in the form in which Middlebury or ETH3D takes them.",
+    ),
     "app": Command(
         _Page, _later("app.launch.run_app"), "Serve the page that measures in the browser (extra 'app')."
     ),
@@ -220,7 +230,13 @@ def _print_version(wanted: bool) -> None:
 def _root(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit."),
+        typer.Option(
+            "--version",
+            callback=_print_version,
+            is_eager=True,
+            metavar="",
+            help="Print the version and exit.",
+        ),
     ] = False,
 ) -> None:
     pass

@@ -29,8 +29,18 @@ APPEARANCE: dict[str, Any] = {
 METAVARS = {bool: "", Path: "PATH", int: "NUMBER", float: "NUMBER"}
 
 
+#: How a number of a type is called that is typed wrong.
+NUMBERS = {int: "a whole number", float: "a number"}
+
+
 class _Group(TyperGroup):
     table: Mapping[str, Command]
+
+    def get_help_option(self, ctx: Any) -> Any:
+        """``--help``, which takes no value to be named."""
+        option = super().get_help_option(ctx)
+        vars(option).update(metavar="")
+        return option
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command that was typed, with its options."""
@@ -102,19 +112,22 @@ def _parameter(field: dataclasses.Field[Any], kind: Any) -> Parameter:
     """An option or argument of typer for a field of a dataclass of options."""
     rules, required = field.metadata, field.default is dataclasses.MISSING
     default: Any = field.default
-    shown: str | bool = True
+    flags, metavar = rules["flags"] or (flag_of(field),), rules["metavar"]
+    about = {"metavar": _metavar(kind) if metavar is None else metavar, "help": rules["help"]}
     if rules["split"]:
-        shown = ", ".join(map(str, default)) or True  # lines of help break at blanks alone
+        if default:  # in the sentence: lines of help break at blanks alone, and it is typed without them
+            listed = "all" if set(default) == set(rules["choices"]) else ", ".join(map(str, default))
+            about["help"] = f"{rules['help'].removesuffix('.')} (default: {listed})."
         kind, default = str | None, ",".join(map(str, default)) or None
     elif get_origin(kind) is tuple:
         kind = list[get_args(kind)[0]]  # type: ignore[misc]
         kind, default = (kind, default) if required else (kind | None, list(default) or None)
-    flags, metavar = rules["flags"] or (flag_of(field),), rules["metavar"]
-    about = {"metavar": _metavar(kind) if metavar is None else metavar, "help": rules["help"]}
+    elif _number(kind):  # read by _value, which says what was typed
+        kind, default = str | None, default if required or default is None else str(default)
     if flags == ("",):
         typed: Any = typer.Argument(**about)
     else:
-        typed = typer.Option(*flags, **about, rich_help_panel=rules["panel"], show_default=shown)
+        typed = typer.Option(*flags, **about, rich_help_panel=rules["panel"], show_default=not rules["split"])
     default = Parameter.empty if required else default
     return Parameter(field.name, Parameter.KEYWORD_ONLY, annotation=Annotated[kind, typed], default=default)
 
@@ -125,6 +138,11 @@ def _metavar(kind: Any) -> str:
     return next((word for name, word in METAVARS.items() if name in kinds), "TEXT")
 
 
+def _number(kind: Any) -> Any:
+    """``int`` or ``float``, where a field is one number; else ``None``."""
+    return next((number for number in NUMBERS if number in (kind, *get_args(kind))), None)
+
+
 def _value(field: dataclasses.Field[Any], value: Any, kind: Any) -> Any:
     """What was typed, as the field has it."""
     if field.metadata["split"]:
@@ -132,4 +150,12 @@ def _value(field: dataclasses.Field[Any], value: Any, kind: Any) -> Any:
         if get_args(kind)[0] is int and not all(part.isdecimal() for part in parts):
             bad_value(flag_of(field), "whole numbers, comma-separated", repr(value))
         return tuple(get_args(kind)[0](part) for part in parts)
-    return tuple(value or ()) if get_origin(kind) is tuple else value
+    if get_origin(kind) is tuple:
+        return tuple(value or ())
+    number = _number(kind)
+    if number is None or value is None:
+        return value
+    try:
+        return number(value)
+    except ValueError:
+        bad_value(flag_of(field), NUMBERS[number], repr(value))

@@ -164,7 +164,7 @@ class PairsOptions(SampleOptions):
         False, "End at the first broken sample, instead of leaving it out and saying so.", panel=OUTPUT
     )
     skip_broken: bool = declare(
-        False, "Does nothing any more: what it asked for is the default.", panel=OUTPUT
+        False, "Deprecated and without effect: broken samples are left out by default.", panel=OUTPUT
     )
     save_depth: bool = declare(False, "Also write every depth map as .npy.", panel=OUTPUT)
 
@@ -178,7 +178,7 @@ class PaperOptions(PairsOptions):
     """The tables of the paper, as the paper made them."""
 
     ensemble: int = count_of(
-        PAPER_ENSEMBLE, "Members of the ensemble (default: the paper's number).", high=1000, panel=PRIOR
+        PAPER_ENSEMBLE, "Members of the ensemble; the paper has ten.", high=1000, panel=PRIOR
     )
 
 
@@ -270,11 +270,19 @@ class _Entry(NamedTuple):
 _PAPER = "paper.run_paper_table"
 _CHANGES = "pairs.run_changes"
 _TABLE = {
-    "pairs": _Entry(DirOptions, "pairs.run_pairs", "Compare methods on every metric pair below DIR."),
-    "table1": _Entry(PaperOptions, _PAPER, "Table 1: KITTI, Booster and Middlebury, in metres and aligned."),
-    "table2": _Entry(PaperOptions, _PAPER, "Table 2: Booster, beside stereo."),
-    "table3": _Entry(PaperOptions, _PAPER, "Table 3: two posed views, Tanks and Temples."),
-    "ablation": _Entry(PaperOptions, _PAPER, "Table 4, and one change at a time: gradients, rules, terms."),
+    "pairs": _Entry(
+        DirOptions,
+        "pairs.run_pairs",
+        "Compare methods on every pair below DIR whose depth is known in metres.",
+    ),
+    "table1": _Entry(
+        PaperOptions, _PAPER, "Table 1 of the paper: KITTI, Booster and Middlebury, in metres and aligned."
+    ),
+    "table2": _Entry(PaperOptions, _PAPER, "Table 2 of the paper: Booster, beside stereo matching."),
+    "table3": _Entry(PaperOptions, _PAPER, "Table 3 of the paper: two posed views of Tanks and Temples."),
+    "ablation": _Entry(
+        PaperOptions, _PAPER, "Table 4 of the paper, and one change at a time: gradients, rules, terms."
+    ),
     "parts": _Entry(PairsOptions, _CHANGES, "The default, with one part left out at a time."),
     "flatness": _Entry(PairsOptions, _CHANGES, "The default, with one number halved or doubled at a time."),
     "cost": _Entry(PairsOptions, "pairs.run_cost", "Seconds and peak memory, plain against guided."),

@@ -347,7 +347,7 @@ class DepthOptions(SpeedOptions, RunOptions):
             what = "K is" if self.estimate_pose else "The cameras are"
             refuse(f"{what} given in several ways, by {' and '.join(taken)}. Give one of: {known}.")
         if not taken and not self.estimate_pose:
-            refuse(f"The cameras are missing. Give {known}: without them two images do not tell metres.")
+            refuse(f"The cameras are missing. Give {known}: there are no metres without them.")
         way = taken[0] if taken else "EXIF"
         missing = [_flag(name) for name in needed.get(way, ()) if getattr(self, name) is None]
         if missing:

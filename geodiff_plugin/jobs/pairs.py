@@ -81,6 +81,10 @@ def find_pairs(options: DepthOptions, tell: Tell = silent) -> list[PairRef]:
     left, right = options.left, options.right
     if is_bag(left):
         return _frames(len(list_pairs(left, options.bag_topics(), options.tolerance)), left, None)
+    if not is_video(left):
+        options.refuse(
+            ["side_by_side"], "{} is for one picture or one video: cut pictures of a folder in two first."
+        )
     if not os.path.isdir(left) and not is_video(left):
         return _of_list(left, right)
     refs, assumed = (_of_folders if os.path.isdir(left) else _of_videos)(left, right)

@@ -133,6 +133,9 @@ def fetch(name: str, hub: dict[str, Any], weights: bool = False, variant: str | 
         return BUNDLED_FOLDER
     if os.path.isdir(name):
         return Path(name)
+    if os.path.isfile(name):
+        cure = "Name its folder. A downloaded checkpoint becomes one by `geodiff convert`."
+        bad_value("prior", "'bundled', a folder or a hub id", f"the file {name}", cure)
     if name.count("/") > 1 or name.startswith((".", "/", "~")):
         bad_value("prior", "'bundled', a folder that is there, or a hub id", repr(name), "Check the path.")
     patterns, ignored = list(SMALL_FILES), None

@@ -22,7 +22,10 @@ TOLD = ["image has an alpha channel; it is dropped."]
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"image": "left.png"}, "image must be a PIL image, a numpy array or a torch tensor; got str"),
+        (
+            {"image": "left.png"},
+            "image must be a PIL image, a numpy array or a torch tensor; got the text 'left.png'",
+        ),
         ({"image": (LEFT, LEFT)}, "image must be a PIL image.*got tuple"),
         ({"image": FLOATS.transpose(2, 0, 1)}, r"image must be .*transpose\(1, 2, 0\)"),
         ({"image": LEFT.astype(np.int64)}, "image must be uint8, uint16 or floats.*got dtype int64"),
@@ -38,7 +41,7 @@ TOLD = ["image has an alpha channel; it is dropped."]
         ({"generator": 7}, "generator must be None, a torch.Generator or a list of them; got int"),
         ({"ensemble_size": 0}, "ensemble_size must be between 1"),
         ({"batch_size": None}, "batch_size must be an integer; got NoneType"),
-        ({"num_inference_steps": "4"}, "num_inference_steps must be an integer; got str"),
+        ({"num_inference_steps": "4"}, "num_inference_steps must be an integer; got the text '4'"),
         ({"processing_resolution": -8}, "processing_resolution must be between 0"),
         ({"resample_method_input": "lanczos"}, "resample_method_input must be one of .* got 'lanczos'"),
         ({"resample_method_output": "cubic"}, "resample_method_output must be one of .* got 'cubic'"),

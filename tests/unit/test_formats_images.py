@@ -174,7 +174,7 @@ def with_value(value):
         (torch.zeros(H, W), ValueError, r"value\[None\]"),
         (torch.zeros(H, W, 3), ValueError, r"permute\(2, 0, 1\)"),
         (np.zeros((H, W, 2)), ValueError, "1, 3 or 4 channels"),
-        ("left.png", TypeError, "right must be a PIL image.*got str"),
+        ("left.png", TypeError, "right must be a PIL image.*got the text"),
     ],
 )
 def test_what_is_no_image(value, error, match):
