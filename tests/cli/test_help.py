@@ -42,6 +42,13 @@ def test_help_of_depth_begins_with_what_is_given_most_and_has_every_option(capsy
             assert len(re.findall(rf"^│ {flags[0]}(?= )", text, re.MULTILINE)) == 1, flags
 
 
+def test_defaults_of_lists_are_in_the_sentence_and_switches_have_no_type(capsys, monkeypatch):
+    said = {words: _help(words.split(), 80, capsys, monkeypatch) for words in ("", "eval", "eval pairs")}
+    sentence = " ".join(said["eval pairs"].replace("│", " ").split())
+    assert "names them (default: prior-aligned, search-only, paper, guided, sgbm)." in sentence
+    assert "<bool>" not in said[""] + said["eval"]
+
+
 @pytest.mark.parametrize("words", [[], ["--prior", "bundled"], ["--knobs"]], ids=" ".join)
 def test_info_fits_eighty_columns_of_a_terminal(words, capsys, monkeypatch):
     from geodiff_plugin.cli import info

@@ -67,6 +67,8 @@ def test_unknown_folders_say_what_to_do(tmp_path):
     (tmp_path / "empty" / "depthfm-v1.ckpt").touch()
     with pytest.raises(ValueError, match="geodiff convert SRC DST"):
         find_prior(tmp_path / "empty")
+    with pytest.raises(ValueError, match="got the file .*depthfm-v1.ckpt. Name its folder"):
+        find_prior(tmp_path / "empty" / "depthfm-v1.ckpt")
     with pytest.raises(ValueError, match="Check the path"):
         find_prior(tmp_path / "nothing")
     with pytest.raises(ValueError, match="of no known kind"):
