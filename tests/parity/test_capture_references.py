@@ -166,6 +166,22 @@ def test_a_depth_and_that_of_other_frames_agree_as_written(sure, others, moving)
         np.testing.assert_allclose(values, each, rtol=1e-5)
 
 
+def test_frames_that_outvote_a_depth_observe_it_though_they_do_not_see_its_point():
+    """A wall at 4 m, which one frame has at 0.5 m: there its points are outside of the others' pictures."""
+
+    def frame(depth: float, x: float) -> DepthFrame:
+        full, E = np.full((7, 9), depth), np.eye(4)
+        E[0, 3] = x
+        return DepthFrame("", full, np.full_like(full, 0.5), K_SMALL, E)
+
+    found = agreed(
+        replace(frame(0.5, 0.0), confidence=np.full((7, 9), 0.1)), [frame(4.0, 0.8), frame(4.0, -0.8)]
+    )
+    middle = (3, 4)
+    assert found.depth[middle] == pytest.approx(4.0, rel=1e-5)
+    assert found.confirmed[middle] == found.observers[middle] == 2
+
+
 def test_of_several_points_of_a_finer_frame_a_pixel_shows_the_nearest():
     """Nine of them; one in three is nearer, and comes before the others."""
     finer = np.diag([3.0, 3.0, 1.0]) @ K_SMALL
