@@ -601,6 +601,7 @@ MUTANTS = [
         ("(depth < (1 - SAME_SHARE) * frame.depth)", "(depth > (1 + SAME_SHARE) * frame.depth)"),
         ("np.argsort(-z[inside], kind", "np.argsort(z[inside], kind"),
         ("same &= (depths > 0) & (depths[candidate] > 0)", "same &= depths[candidate] > 0"),
+        ("same &= (depths > 0) & (depths[candidate] > 0)", "same &= depths > 0"),
         tests=CAPTURES,
     ),
     *of(

@@ -148,7 +148,8 @@ def _agreed(depth: float, sure: float, others: list[tuple[float, float]], moving
         (0.3, [(1.5, 0.2), (1.45, 0.2), (3.0, 0.9)], False),  # but not with less weight
         (0.9, [(1.5, 0.9), (1.45, 0.95), (1.5, 0.8)], True),  # nor what may have moved, if it is sure
         (0.7, [(1.5, 0.9), (1.45, 0.95), (1.5, 0.8)], True),
-        (0.3, [(0.0, 0.9), (0.0, 0.9), (1.5, 0.4)], False),  # without a depth they say nothing
+        (0.1, [(0.0, 0.9), (0.0, 0.9), (1.0, 0.4)], False),  # without a depth they say nothing
+        (0.1, [(0.0, 0.9), (0.95, 0.4), (1.05, 0.4)], False),  # nor of what others agree on
     ],
 )
 def test_a_depth_and_that_of_other_frames_agree_as_written(sure, others, moving):
