@@ -43,7 +43,7 @@ UNIT = f"({'|'.join(UNITS)})"
 #: Words between those of a matrix and the side of its camera.
 CAMERA = "(?:cam(?:era)?)?"
 WORDS = {
-    "M": "m|k|mtx|(?:cam|camera|k|new)?(?:mtx|mats?|matrix)|intr|intrinsics?(?:m(?:tx|at|atrix))?",
+    "M": "m|k|mtx|(?:cam|camera)?(?:mtx|mats?|matrix)|intr|intrinsics?(?:m(?:tx|at|atrix))?",
     "D": "d|(?:dis|dist|disto|distort|distortions?)(?:coe?f?fs?|coe?f?ficients?|vec|vector|param(?:eter)?s)?",
     "R": "r|rrect|(?:rect|rectification)(?:rot|rotation|trans|transform|mats?|matrix)?",
     "P": "p|(?:proj|projection)(?:mats?|matrix)?",
@@ -104,10 +104,10 @@ FOR_BOTH = ("M", "D")
 SHARED = ("imagesize", "imagewidth", "imageheight")
 #: A left camera of number 0.
 FROM_ZERO = re.compile(_of(WORDS["M"], 0, "zero"))
-#: Sizes and other numbers in a chessboard's name, whose unit is that of the translation.
+#: Names of the size of a board's squares with a unit, which is that of the translation.
 SQUARE = re.compile(f"(?:square|pattern|marker|checker|tag|grid)[a-z]*(?:size|length|spacing){UNIT}")
-#: Metres between cameras that were calibrated with a board, at least and at most.
-LIKELY_BASELINE_M = (0.005, 5.0)
+#: Metres between cameras in the unit of the board, at least and at most; a translation may count squares.
+LIKELY_BASELINE_M = (0.02, 5.0)
 #: A longer baseline is in another unit unless the file says which.
 LONGEST_UNSTATED_M = 1.5
 #: Lengths of one thing that a file gives twice are equal to this share.

@@ -279,3 +279,16 @@ def test_left_right_and_pose_may_be_three_files(tmp_path, order):
     rig = read_texts(tmp_path, *(yaml.safe_dump(files[n]) for n in order), distorted=True)
     is_the_rig(rig)
     assert rig.size_left == rig.size_right == (800, 600)
+
+
+def test_a_translation_that_counts_squares_is_not_taken_for_millimetres(tmp_path):
+    entries = {"K1": LEFT, "K2": RIGHT, "R": R, "T": [-7.1, 0, 0], "square_size_mm": 24.5}
+    with noted() as said, pytest.warns(UserWarning, match="squares of the board"):
+        read(tmp_path, entries)
+    assert [message.code for message in said] == ["calibration.assumed-metres"]
+
+
+def test_the_matrix_of_undistorted_pictures_is_not_that_of_the_camera(tmp_path):
+    """As getOptimalNewCameraMatrix gives it, which tutorials save beside the camera's."""
+    cameras = {"mtx_left": LEFT, "mtx_right": RIGHT, "new_mtx_left": RIGHT, "new_camera_matrix_right": LEFT}
+    is_the_rig(read(tmp_path, cameras | {"dist_left": LENS, "dist_right": LENS, "R": R, "T": SHIFT_M}))
