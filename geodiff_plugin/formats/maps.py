@@ -66,8 +66,8 @@ def _picture_map(file: Path, name: str) -> np.ndarray:
 def _floats_of_bytes(rgba: np.ndarray) -> np.ndarray | None:
     """The ``(H, W)`` float32 metres that TartanAir V2 keeps in the bytes of a PNG, or ``None`` for a picture.
 
-    A picture's alpha of 255 makes no positive number. Source: ``depth_rgba_float32`` of
-    castacks/tartanairpy, whose OpenCV has blue first.
+    A picture's alpha of 255 makes no positive number. Source: ``DataLoader/Dataset/TartanAir.py`` of
+    MAC-VO/MAC-VO, which reads by OpenCV, so blue first.
     """
     floats = np.ascontiguousarray(rgba[..., [2, 1, 0, 3]]).view("<f4")[..., 0]
     with np.errstate(invalid="ignore"):

@@ -1,7 +1,6 @@
 """Points of PCD files, ASCII, binary or compressed.
 
-Source: PCL's description of the format, version 0.7, and ``lzfDecompress`` of ``io/src/lzf.cpp`` of
-PointCloudLibrary/pcl.
+Source: PCL's description of the format, version 0.7, whose compressed form is LZF.
 """
 
 from __future__ import annotations
