@@ -413,8 +413,9 @@ MESSAGES: dict[str, MessageKind] = {
     ),
     "views.distorted": MessageKind(
         "The pictures are not free of lens distortion",
-        cause="They are the camera's own, and the calibration comes without its distortion.",
-        cure="Rectify the pictures, or give a calibration that holds the distortion.",
+        cause="They are the camera's own, and the calibration comes without its distortion; or they were "
+        "rectified already, and the calibration comes with it.",
+        cure="Rectify the pictures once, or give the camera's own and a calibration that holds the distortion.",
         forbids_trust=True,
     ),
     "views.bent": MessageKind(
@@ -436,6 +437,18 @@ MESSAGES: dict[str, MessageKind] = {
         cure="Take another frame; synchronise read-out and exposure.",
         forbids_trust=True,
     ),
+    "views.moved": MessageKind(
+        "A part of the pictures moved between them",
+        cause="The pictures were not taken at one moment, and something moved.",
+        cure="Take both at one moment, or of a scene that stands still.",
+        forbids_trust=True,
+    ),
+    "views.bars": MessageKind(
+        "Bars of one colour lie at opposite sides of the pictures",
+        cause="The pictures were fitted into another format.",
+        cure="Cut the bars off and give the K of what is left. If K is of the pictures with bars, ignore the "
+        "message.",
+    ),
     "views.overlap": MessageKind(
         "The views overlap little",
         cause="A small share of the left image is seen by a right camera.",
@@ -446,6 +459,13 @@ MESSAGES: dict[str, MessageKind] = {
         cause="Left and right are swapped, the sign of the baseline is wrong, E is world-to-camera, or a "
         "prior map is of another space.",
         cure="Exchange the images, change the sign, invert E, or name the space of the map (--space).",
+        forbids_trust=True,
+    ),
+    "depth.occlusion": MessageKind(
+        "What is matched as far hides what is near",
+        cause="Left and right are swapped, or both pictures are mirrored or upside down, and the principal "
+        "points of the cameras differ.",
+        cure="Exchange the images, or turn them as the cameras took them.",
         forbids_trust=True,
     ),
     "depth.order": MessageKind(

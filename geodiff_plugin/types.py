@@ -98,7 +98,9 @@ class PoseReport:
     distortion: float = math.nan  # radial coefficient k1 that both pictures still have for certain
     distortion_alone: float = math.nan  # what of it neither a turn nor a shear of the right picture explains
     tear: Tear | None = None  # where a picture is torn
+    bars: float = 0.0  # width of bars at opposite sides of all pictures, as a share of that side
     exchangeable: float = math.nan  # share of the matches that fit as well with near and far exchanged
+    moved: float = math.nan  # share of the matches in parts that moved, where the others fit the given pose
     warnings: tuple[Message, ...] = ()
 
 
@@ -181,6 +183,9 @@ class Indicators:
     distortion_alone: float = math.nan  # what of it neither a turn nor a shear of the right picture explains
     tear: Tear | None = None  # where a picture is torn
     exchangeable: float = math.nan  # share of the matches that fit as well with near and far exchanged
+    occlusion: float = math.nan  # [-1, 1], below 0 where what is matched as far hides what is near
+    moved: float = math.nan  # share of the matches in parts that moved, where the others fit the given pose
+    bars: float = 0.0  # width of bars at opposite sides of all pictures, as a share of that side
     shear: float = math.nan  # of the right picture from its first row to its last, in shares of its width
     off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
     doubts: tuple[Message, ...] = ()  # warnings about the input, each of which forbids trust

@@ -16,6 +16,7 @@ from geodiff_plugin.geometry import image_size, is_rectified, resize_image, size
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import known_share
 from geodiff_plugin.matching.matches import Matches
+from geodiff_plugin.matching.occlusion import occlusion_order
 from geodiff_plugin.matching.uprights import certain_shear, upright_lines
 from geodiff_plugin.types import CameraView, PosedViews
 
@@ -54,6 +55,7 @@ class RowMatches(NamedTuple):
     filled: Tensor  # 1 in another gap between two; the shift of a gap is that of its farther end
     baseline_m: Tensor  # () distance of the cameras, metres, on the CPU
     shear: float = math.nan  # of the right picture along its rows, pixels per row, as far as it is certain
+    occlusion: float = math.nan  # [-1, 1], below 0 where what is matched as far hides what is near
 
     @property
     def certain(self) -> Tensor:
@@ -197,12 +199,13 @@ def match_rows(pictures: RowPictures, nearest_px: float) -> RowMatches:
     between = np.logical_or.accumulate(known, 1) & np.logical_or.accumulate(known[:, ::-1], 1)[:, ::-1]
     filled = between & ~known & ~hidden
     shear = certain_shear(pictures.lines, shift, known)
+    order = occlusion_order(pictures.left, shift, known)
     shift = np.nan_to_num(fill_background(np.where(known, shift, np.float32(np.nan))))
     maps = np.stack([shift, known, hidden, filled])
     maps = np.ascontiguousarray(maps[..., ::-1] if pictures.shift_m > 0 else maps)
     shift_on, matched, hidden_on, filled_on = torch.from_numpy(maps).to(pictures.device)
     baseline_m = torch.tensor(abs(pictures.shift_m), device="cpu")
-    return RowMatches(shift_on, matched, hidden_on, filled_on, baseline_m, shear)
+    return RowMatches(shift_on, matched, hidden_on, filled_on, baseline_m, shear, order)
 
 
 def with_hidden(matches: Matches, rows: RowMatches, focal_px: float) -> Matches:

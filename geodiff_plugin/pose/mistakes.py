@@ -171,7 +171,7 @@ def find_mistake(tracks: Tracks, T: np.ndarray, near: np.ndarray) -> Message | N
 
 
 def exchangeable(
-    tracks: Tracks, given: np.ndarray, near: np.ndarray, sizes: Sequence[tuple[int, int]]
+    tracks: Tracks, given: np.ndarray, near: np.ndarray, sizes: Sequence[tuple[int, ...]]
 ) -> float:
     """Share of the matches that fit as well if near and far are exchanged, [0, 1]; NaN for too few.
 
@@ -194,7 +194,7 @@ def exchangeable(
     return min(shares, default=math.nan)
 
 
-def _exchanged(tracks: Tracks, left: tuple[int, int], right: tuple[int, int]) -> Iterator[Tracks]:
+def _exchanged(tracks: Tracks, left: tuple[int, ...], right: tuple[int, ...]) -> Iterator[Tracks]:
     """Tracks of one right view with the pictures exchanged, mirrored, and turned by 180 degrees."""
     yield replace(tracks, left_px=tracks.right_px[0], right_px=tracks.left_px[None])
     for turned in (np.array([True, False]), np.array([True, True])):

@@ -16,8 +16,10 @@ import torch
 from torch import Tensor
 
 from geodiff_plugin.messages import Message, distinct
+from geodiff_plugin.pose.bars import bar_share
 from geodiff_plugin.pose.lens import remaining_distortion
 from geodiff_plugin.pose.mistakes import exchangeable, find_mistake, pose_change
+from geodiff_plugin.pose.moving import moved_share
 from geodiff_plugin.pose.solve import is_rig, nearby_poses, settle_poses
 from geodiff_plugin.pose.tearing import find_tear
 from geodiff_plugin.pose.tracks import (
@@ -128,15 +130,14 @@ def refine_views(posed: PosedViews, measured: bool = False) -> CheckedViews:
     fits_px = FITS_PX if rig else POSED_FITS_PX
     fits = not (before > fits_px).any()
     near = given if fits else nearby_poses(sparse, given, before)
-    heights = [image.shape[-2] for image in (posed.left_01, *(right.image_01 for right in rights))]
-    tear = find_tear([grey for grey, _ in views], heights)
-    report = _with_contradictions(replace(report, tear=tear), sparse, given)
-    sizes = [(grey.shape[0], grey.shape[1]) for grey, _ in views]
-    report = replace(report, exchangeable=exchangeable(sparse, given, near, sizes))
+    greys = [grey for grey, _ in views]
+    report = _with_contradictions(_with_pictures(report, posed, greys), sparse, given)
+    report = replace(report, exchangeable=exchangeable(sparse, given, near, [grey.shape for grey in greys]))
     if mistakes := _messages(sparse, find_mistake, given, near):
         return CheckedViews(rights, replace(report, status="mistaken", warnings=mistakes))
     if fits:
-        return CheckedViews(rights, report)
+        shares = [moved_share(sparse.view(v), T) for v, T in enumerate(given)]
+        return CheckedViews(rights, replace(report, moved=float(np.fmax.reduce(shares))))
     depth_m = coarse_depth(posed._replace(views=_applied(rights, near)), views[0][0].shape)
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
     if rig and not ((all_px := median_residuals(tracks, given)) > fits_px).any():
@@ -146,6 +147,12 @@ def refine_views(posed: PosedViews, measured: bool = False) -> CheckedViews:
         return CheckedViews(rights, report)
     sizes = [(image.shape[0], image.shape[1]) for image, _ in views[1:]]
     return _refined(_Misfit(rights, sizes, tracks, given, near, fits_px, rig, measured), report)
+
+
+def _with_pictures(report: PoseReport, posed: PosedViews, greys: Sequence[np.ndarray]) -> PoseReport:
+    """The report with what the grey pictures show alone, the left one first."""
+    heights = [image.shape[-2] for image in (posed.left_01, *(view.image_01 for view in posed.views))]
+    return replace(report, tear=find_tear(greys, heights), bars=bar_share(greys))
 
 
 def _with_contradictions(report: PoseReport, tracks: Tracks, given: np.ndarray) -> PoseReport:

@@ -141,13 +141,15 @@ def indicators_of(
             known[name] = max((px for px in residuals if not math.isnan(px)), default=math.nan)
         known |= {"behind_infinity": pose.behind_infinity, "distortion": pose.distortion}
         known |= {"distortion_alone": pose.distortion_alone, "tear": pose.tear}
-        known["exchangeable"] = pose.exchangeable
+        known |= {"exchangeable": pose.exchangeable, "moved": pose.moved, "bars": pose.bars}
         known["depth_spread"] = pose.depth_spread
         known["straightened_px"] = max(pose.straightened_px, default=0.0)
         if not math.isnan(pose.behind_px):  # a product would be another NaN, and verdicts would differ by it
             known["behind_px"] = pose.behind_px * pixels_of_matches(native.size)
         known["mistakes"] = tuple(m for m in pose.warnings if m.forbids_trust and m.code != INVERSE.code)
     rows = None if evidence.rows is None else evidence.rows.result()
+    if rows is not None:
+        known["occlusion"] = rows.occlusion
     if rows is not None and not math.isnan(rows.shear):  # a product would be another NaN, as above
         known["shear"] = rows.shear * native.size[0] / native.size[1]  # pixels are square on its grid
     if native.views and has_unit:

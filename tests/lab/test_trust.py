@@ -25,6 +25,8 @@ def test_every_kind_of_wrong_calibration_changes_what_it_says(sample):
     expected = {"swapped": {"left", "right"}, "unrelated": {"right", "K_right"}}
     expected |= dict.fromkeys(("mirrored", "one-picture", "shifted"), {"right"})
     expected |= dict.fromkeys(("moved-part", "rolling", "stretched"), {"right"})
+    expected |= dict.fromkeys(("moved-across", "saved-twice"), {"right"})
+    expected |= dict.fromkeys(("bars", "upside-down"), {"left", "right"})
     expected |= {"distorted": {"left", "right"}, "centre": {"K_right"}, "yaw": {"E"}}
     expected |= {kind: set() for kind, made in KINDS.items() if made.points or kind in RIGHT}
     names = ("left", "right", "K_left", "K_right", "E")

@@ -132,6 +132,44 @@ def _yawed(sample: StereoSample, _: StereoSample) -> StereoSample:
     return replace(sample, E=sample.E @ yaw)
 
 
+def _moved_across(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """The middle of the right picture, an ellipse of two fifths of it, has moved across the rows as well."""
+    height, width = sample.right.shape[:2]
+    v, u = np.indices((height, width))
+    inside = ((u - width / 2) / (0.36 * width)) ** 2 + ((v - height / 2) / (0.44 * height)) ** 2 < 1
+    shift = np.array([[1, 0, _px(sample, 5)], [0, 1, _px(sample, 6)]], np.float32)
+    moved_picture = cv2.warpAffine(sample.right, shift, (width, height), borderMode=cv2.BORDER_REFLECT)
+    return replace(sample, right=np.where(inside[..., None], moved_picture, sample.right))
+
+
+def _between_bars(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """Both pictures are squeezed to three quarters of their width, between black bars; K is not."""
+
+    def squeezed(image: np.ndarray, way: int = cv2.INTER_AREA) -> np.ndarray:
+        height, width = image.shape[:2]
+        narrow = cv2.resize(image, (width * 3 // 4, height), interpolation=way)
+        bar = (width - narrow.shape[1]) // 2
+        made = np.zeros_like(image)
+        made[:, bar : bar + narrow.shape[1]] = narrow
+        return made
+
+    depth_m = squeezed(np.where(sample.valid, sample.depth_m, 0), cv2.INTER_NEAREST)
+    pictures = {"left": squeezed(sample.left), "right": squeezed(sample.right)}
+    return replace(sample, **pictures, depth_m=depth_m, valid=depth_m > 0)
+
+
+def _upside_down(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """Both pictures are turned by 180 degrees, and the truth with the left one."""
+    names = ("left", "right", "depth_m", "valid")
+    return replace(sample, **{name: getattr(sample, name)[::-1, ::-1].copy() for name in names})
+
+
+def _saved_twice(sample: StereoSample, _: StereoSample) -> StereoSample:
+    """The left picture as it is, and as a JPEG."""
+    again = cv2.imdecode(cv2.imencode(".jpg", sample.left, [cv2.IMWRITE_JPEG_QUALITY, 70])[1], 1)
+    return replace(sample, right=again, K_right=sample.K_left)
+
+
 def _as_it_is(sample: StereoSample, _: StereoSample) -> StereoSample:
     return sample
 
@@ -172,6 +210,11 @@ KINDS: dict[str, Kind] = {
     "rolling": Kind("rolling shutter of 15 px", _rolled),
     "centre": Kind("right cx off by 10 px, far things behind infinity", _off_centre),
     "stretched": Kind("right picture cropped by a tenth and stretched", _stretched),
+    "moved-across": Kind("two fifths of the right picture moved by 5 and 6 px", _moved_across),
+    "bars": Kind("both pictures squeezed between bars", _between_bars),
+    "upside-down": Kind("both pictures upside down", _upside_down),
+    "saved-twice": Kind("the left image twice, once as a JPEG", _saved_twice),
+    "feet": Kind("baseline in feet", lambda s, _: moved(s, s.E[:3, 3] / 0.3048)),
     "yaw": Kind("E turned by 1 degree of yaw", _yawed),
     "points-256": Kind("points in 1/256 m read as millimetres", points=0.256),
     "points-mm": Kind("points in millimetres read as metres", points=1000.0),

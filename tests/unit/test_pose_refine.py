@@ -17,6 +17,7 @@ from geodiff_plugin.pose import refine
 from geodiff_plugin.pose import tracks as tracks_module
 from geodiff_plugin.pose.lens import remaining_distortion
 from geodiff_plugin.pose.mistakes import _candidates, exchangeable, find_mistake
+from geodiff_plugin.pose.moving import moved_share
 from geodiff_plugin.pose.refine import depths_apart, fit_displacement, refine_views, straightened
 from geodiff_plugin.pose.solve import PosePrior, is_rig, settle_poses, solve_poses
 from geodiff_plugin.pose.tracks import (
@@ -315,6 +316,21 @@ def test_the_matches_show_whether_near_and_far_could_be_exchanged(E, centre_off_
     )
     assert [exchangeable(each, Ts, Ts, sizes) for each in mistaken] == [1.0, 1.0]
     assert np.isnan(exchangeable(tracks.kept(slice(39)), Ts, Ts, sizes))
+
+
+@pytest.mark.parametrize(("part", "share"), [(0.0, 0.0), (0.3, 0.3), (0.45, 0.45)])
+def test_a_part_that_moved_across_the_lines_is_seen_where_the_rest_fits(part: float, share: float) -> None:
+    tracks, Ts, _ = make_tracks([RIG], count=1500, noise_px=0.2, outliers=0.05)
+    moved = tracks.left_px[:, 0] < np.quantile(tracks.left_px[:, 0], part)
+    shifted = replace(tracks, right_px=tracks.right_px + np.outer(moved, [3.0, 6.0]))
+    assert moved_share(shifted, Ts[0]) == pytest.approx(share, abs=0.07)
+    apart = np.random.default_rng(0).uniform(-25, 25, len(tracks))  # wrong matches, each by its own
+    wrong = replace(tracks, right_px=tracks.right_px + np.outer(moved * apart, [0.0, 1.0]))
+    assert moved_share(wrong, Ts[0]) == 0.0
+    a_little = replace(tracks, right_px=tracks.right_px + np.outer(moved, [3.0, 1.7]))
+    assert moved_share(a_little, Ts[0]) == 0.0
+    assert np.isnan(moved_share(tracks.kept(slice(39)), Ts[0]))
+    assert np.isnan(moved_share(tracks.kept(slice(0)), Ts[0]))
 
 
 @pytest.mark.parametrize("k1", [-0.25, -0.1, 0.0, 0.2])

@@ -15,6 +15,8 @@ GOOD = Indicators(
 ALONE = Indicators(points=99, cover=0.5, rank_correlation=0.8)
 #: What excludes that near and far are exchanged, under a prior that says so.
 ORDERED = {"rank_correlation": -0.5, "exchangeable": 0.1, "epipolar_px": 0.3, "off_matches": 0.01}
+#: What shows that they are.
+HIDDEN = {"rank_correlation": 0.3, "exchangeable": 0.9, "occlusion": -0.9}
 #: Codes of reasons and remarks, what is given beside, the indicator, and values without and with the message.
 TABLE = (
     ("depth.off-matches", {}, "off_matches", math.log(1.19), math.log(1.21)),
@@ -31,6 +33,12 @@ TABLE = (
     ("depth.exchanged", ORDERED, "epipolar_px", 0.95, 1.05),
     ("depth.exchanged", ORDERED, "matched", 0.51, 0.49),
     ("depth.exchanged", ORDERED, "off_matches", math.log(1.04), math.log(1.06)),
+    ("depth.exchanged", ORDERED | {"exchangeable": 0.9}, "occlusion", 0.36, 0.34),
+    ("depth.occlusion", HIDDEN, "occlusion", -0.34, -0.36),
+    ("depth.occlusion", HIDDEN, "exchangeable", 0.29, 0.31),
+    ("depth.occlusion", HIDDEN, "rank_correlation", 0.46, 0.44),
+    ("views.moved", {}, "moved", 0.14, 0.16),
+    ("views.bars", {}, "bars", 0.0, 0.03),
     ("prior.order", ORDERED, "rank_correlation", -0.19, -0.21),
     ("prior.order", ORDERED, "exchangeable", 0.31, 0.29),
     ("prior.order", ORDERED, "spread", 0.149, 0.151),
