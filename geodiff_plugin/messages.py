@@ -415,7 +415,8 @@ MESSAGES: dict[str, MessageKind] = {
         "The pictures are not free of lens distortion",
         cause="They are the camera's own, and the calibration comes without its distortion; or they were "
         "rectified already, and the calibration comes with it.",
-        cure="Rectify the pictures once, or give the camera's own and a calibration that holds the distortion.",
+        cure="Rectify the pictures once, or give the camera's own with a calibration that holds the "
+        "distortion.",
         forbids_trust=True,
     ),
     "views.bent": MessageKind(

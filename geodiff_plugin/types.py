@@ -203,7 +203,7 @@ class Verdict:
     They cannot show a wrong length of the baseline, nor, of a rectified pair, a wrong focal length. Of what
     shifts matches along their epipolar lines (cx of the right camera, the yaw of nearly parallel ones, a
     stretched picture, a rolling shutter, moving things) they show what puts things behind infinity, a torn
-    picture, and a shear of upright lines.
+    picture, a shear of upright lines, and where far things hide near ones.
     """
 
     status: str  # "trusted", "not trusted", or "not judged": there was nothing to compare it with
