@@ -694,7 +694,33 @@ MUTANTS = [
         "matching/uprights.py",
         ("_certain_median(flat - float(", "_certain_median(flat + float("),
         ("min(certain, key=abs) if certain[0]", "max(certain, key=abs) if certain[0]"),
+        ("MOST_APART = 0.06", "MOST_APART = 6.0"),
         tests=(f"{UNIT}uprights.py",),
+    ),
+    *of(
+        "matching/occlusion.py",
+        ("difference = at_near.max(1) - at_far.max(1)", "difference = at_far.max(1) - at_near.max(1)"),
+        ("steps[row, near - 1 + beside]", "steps[row, near + 1 + beside]"),
+        ("(rise >= LEAST_RISE_PX) & as_wide", "rise >= LEAST_RISE_PX"),
+        tests=(f"{UNIT}occlusion.py",),
+    ),
+    *of(
+        "pose/bars.py",
+        ("[_bar(lines), _bar(lines[::-1])]", "[_bar(lines), _bar(lines)]"),
+        ("grey if turned else grey.T", "grey.T if turned else grey.T"),
+        tests=(f"{UNIT}bars.py",),
+    ),
+    *of(
+        "pose/moving.py",
+        ("apart < TOGETHER * abs(middle)", "apart < 10.0 * abs(middle)"),
+        ("moved / compared if", "moved / len(off_px) ** 2 if"),
+        tests=(f"{UNIT}pose_refine.py",),
+    ),
+    *of(
+        "pose/mistakes.py",
+        ("left_px=tracks.right_px[0], right_px=tracks.left_px[None])", "left_px=tracks.left_px)"),
+        ("return min(shares, default=math.nan)", "return 1.0 - min(shares, default=math.nan)"),
+        tests=(f"{UNIT}pose_refine.py",),
     ),
     *of(
         "pose/lens.py",

@@ -136,8 +136,7 @@ def refine_views(posed: PosedViews, measured: bool = False) -> CheckedViews:
     if mistakes := _messages(sparse, find_mistake, given, near):
         return CheckedViews(rights, replace(report, status="mistaken", warnings=mistakes))
     if fits:
-        shares = [moved_share(sparse.view(v), T) for v, T in enumerate(given)]
-        return CheckedViews(rights, replace(report, moved=float(np.fmax.reduce(shares))))
+        return CheckedViews(rights, report)
     depth_m = coarse_depth(posed._replace(views=_applied(rights, near)), views[0][0].shape)
     tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
     if rig and not ((all_px := median_residuals(tracks, given)) > fits_px).any():
@@ -158,8 +157,10 @@ def _with_pictures(report: PoseReport, posed: PosedViews, greys: Sequence[np.nda
 def _with_contradictions(report: PoseReport, tracks: Tracks, given: np.ndarray) -> PoseReport:
     """The report with what the matches say against the poses ``given (V, 4, 4)`` and the pictures."""
     distortion, behind = remaining_distortion(tracks.view(0), given[0]), behind_infinity(tracks, given)
+    moved = [moved_share(tracks.view(v), T) for v, T in enumerate(given)]
     return replace(
         report,
+        moved=float(np.fmax.reduce(moved)),
         behind_infinity=behind.share,
         behind_px=behind.px,
         distortion=distortion.k1,
