@@ -100,7 +100,7 @@ class PoseReport:
     tear: Tear | None = None  # where a picture is torn
     bars: float = 0.0  # width of bars at opposite sides of all pictures, as a share of that side
     exchangeable: float = math.nan  # share of the matches that fit as well with near and far exchanged
-    moved: float = math.nan  # share of the matches in parts that moved, where the others fit the given pose
+    moved: float = math.nan  # share of the matches in parts that moved across the lines of the given pose
     warnings: tuple[Message, ...] = ()
 
 
@@ -184,7 +184,7 @@ class Indicators:
     tear: Tear | None = None  # where a picture is torn
     exchangeable: float = math.nan  # share of the matches that fit as well with near and far exchanged
     occlusion: float = math.nan  # [-1, 1], below 0 where what is matched as far hides what is near
-    moved: float = math.nan  # share of the matches in parts that moved, where the others fit the given pose
+    moved: float = math.nan  # share of the matches in parts that moved across the lines of the given pose
     bars: float = 0.0  # width of bars at opposite sides of all pictures, as a share of that side
     shear: float = math.nan  # of the right picture from its first row to its last, in shares of its width
     off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth

@@ -700,7 +700,7 @@ MUTANTS = [
     *of(
         "matching/occlusion.py",
         ("difference = at_near.max(1) - at_far.max(1)", "difference = at_far.max(1) - at_near.max(1)"),
-        ("steps[row, near - 1 + beside]", "steps[row, near + 1 + beside]"),
+        ("beside = np.arange(-REACH_PX, REACH_PX + 1)", "beside = np.arange(1)"),
         ("(rise >= LEAST_RISE_PX) & as_wide", "rise >= LEAST_RISE_PX"),
         tests=(f"{UNIT}occlusion.py",),
     ),

@@ -24,7 +24,7 @@ def moved_share(tracks: Tracks, T: np.ndarray) -> float:
     """Share of the matches of one right view that lie in blocks that moved, [0, 1]; NaN for too few.
 
     Matches that are wrong lie off their lines each by its own distance, those of a thing that moved by about
-    one. Only where the pose ``T (4, 4)``, ``T_right_from_left``, fits the others does it mean that.
+    one, and by several times what is usual under the pose ``T (4, 4)``, ``T_right_from_left``.
     """
     off_px = epipolar(tracks, T).off_px
     usual_px = float(np.median(np.abs(off_px))) if len(off_px) else math.nan

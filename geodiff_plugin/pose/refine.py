@@ -6,6 +6,7 @@ removed from the right image afterwards, by a smooth displacement across the epi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -157,10 +158,10 @@ def _with_pictures(report: PoseReport, posed: PosedViews, greys: Sequence[np.nda
 def _with_contradictions(report: PoseReport, tracks: Tracks, given: np.ndarray) -> PoseReport:
     """The report with what the matches say against the poses ``given (V, 4, 4)`` and the pictures."""
     distortion, behind = remaining_distortion(tracks.view(0), given[0]), behind_infinity(tracks, given)
-    moved = [moved_share(tracks.view(v), T) for v, T in enumerate(given)]
+    moved = (moved_share(tracks.view(v), T) for v, T in enumerate(given))
     return replace(
         report,
-        moved=float(np.fmax.reduce(moved)),
+        moved=max((share for share in moved if not math.isnan(share)), default=math.nan),
         behind_infinity=behind.share,
         behind_px=behind.px,
         distortion=distortion.k1,

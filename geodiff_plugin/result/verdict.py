@@ -85,8 +85,8 @@ MOST_BEHIND = 0.05
 #: A larger radial coefficient k1 left in both pictures is not trusted: what is certain of it was up to .07
 #: for right pairs, and .12 to .46 where a distortion of .25 had not been removed, but for two of few matches.
 MOST_DISTORTION = 0.11
-#: A larger share of matches in parts that moved is not trusted: it was up to .07 for right pairs whose pose
-#: fits, and .32 to .39 for three half of whose right picture had moved and whose pose still fitted.
+#: A larger share of matches in parts that moved is not trusted: it was up to .10 for 66 right pairs,
+#: whose poses may be off, and .32 to .39 where half of the right picture had moved and the rest fitted.
 MOST_MOVED = 0.15
 #: A larger shear of the right picture along its rows, in shares of its width, is not trusted: what is certain
 #: of it was 0 for 38 right pairs of parallel cameras, and .0048 to .021 for 9 of 14 with a shear of .023.

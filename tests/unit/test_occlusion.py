@@ -38,7 +38,7 @@ def test_few_occlusions_say_nothing(rows, known):
 def test_gaps_that_are_no_occlusions_say_nothing():
     grey, shift, matched = box_before_a_wall()
     unlit = np.full_like(grey, 100)
-    small = np.where(shift > 5.0, 8.0, 5.0).astype(np.float32)  # the gap is four times as wide as the rise
+    small = np.where(shift > 5.0, 10.0, 5.0).astype(np.float32)  # the gap is twice as wide as the rise
     at_edge = np.roll(matched, -(BOX.start - RISE - REACH_PX + 1), axis=1)
     for case in ((unlit, shift, matched), (grey, small, matched), (grey, shift, at_edge)):
         assert np.isnan(occlusion_order(*case))
