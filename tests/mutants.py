@@ -403,7 +403,7 @@ MUTANTS = [
         ("_behind_infinity(found) and not found.centre_assumed", "_behind_infinity(found)"),
         ("WEAK_CONFIDENCE = 0.53", "WEAK_CONFIDENCE = 0.55"),
         ("WEAK_MATCHED = 0.38", "WEAK_MATCHED = 0.35"),
-        ("found.exchangeable < EXCHANGEABLE and", "found.exchangeable >= EXCHANGEABLE and"),
+        ("found.exchangeable < EXCHANGEABLE or", "found.exchangeable >= EXCHANGEABLE or"),
         ("_order_contradicts(found) and not _order_known(found)", "_order_contradicts(found)"),
         tests=THRESHOLDS,
     ),
