@@ -148,7 +148,8 @@ def read_capture(
     frames = [each.frame for each in finished if not each.problem]
     is_typed = K is not None or fov is not None
     said = [note for note in layout.notes if not (is_typed and note.code == "capture.assumed-k")]
-    notes = [*_reasons(finished), *said, *_turned(frames), *_other_sizes(finished)]
+    notes = [*_reasons(finished), *said, *_turned(frames)]
+    notes += [] if is_typed else _other_sizes(finished)
     if layout.has_poses and frames and not tracked:
         sentence = f"No frame of {layout.kind} has a pose: they are solved for, without a unit."
         notes.append(Message("capture.no-poses", sentence))

@@ -60,6 +60,8 @@ DISTORTED_FOLDERS = ("resized_images", "original_images")
 #: What files call the map of known depths of a frame.
 DEPTHS = ("depth_file_path", "depth_path")
 DEPTH_SUFFIXES = (".png", ".npy", ".tiff", ".tif", ".exr")
+#: Entries that say a focal length.
+FOCALS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 #: The kind of these captures.
 TRANSFORMS = "transforms.json"
 #: Entries of a frame's camera as they are written: a pinhole in pixels, of OpenCV's model with no distortion.
@@ -238,7 +240,9 @@ def _notes(file: Path) -> tuple[Message, ...]:
 
 
 def _build(frame: CaptureFrame, entries: Frame, folder: Path) -> Candidate:
-    camera = nerf_camera(entries, stored_size(frame.image, f"{frame.image}"))
+    # Without a focal length K is typed, or of the photograph's EXIF.
+    known = any(entries.get(key) is not None for key in FOCALS)
+    camera = nerf_camera(entries, stored_size(frame.image, f"{frame.image}")) if known else None
     named = next((entries[key] for key in DEPTHS if entries.get(key)), None)
     names = [f"depth/{frame.image.stem}{suffix}" for suffix in DEPTH_SUFFIXES] if named is None else [named]
     maps = (folder / str(name).replace("\\", "/") for name in names)

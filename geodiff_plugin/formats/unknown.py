@@ -61,7 +61,7 @@ FOREIGN = (
     ),
     ForeignFormat(("*.mg",), "a project of Meshroom", "Give cameras.sfm of its StructureFromMotion folder."),
     ForeignFormat(("*.mvs",), "a scene of OpenMVS", "Give the COLMAP model that it was made from."),
-    ForeignFormat(("database.db",), "COLMAP's matches without a model", MAPPER),
+    ForeignFormat(("database.db",), "COLMAP's matches without a model", MAPPER, has_poses=False),
     ForeignFormat(("*_annotations.jgz",), "annotations of CO3D", "Write a sequence as transforms.json."),
     ForeignFormat(("*.svo", "*.svo2"), "a recording of ZED", "Export it as a video with ZED_SVO_Editor."),
     ForeignFormat(("*.rcproj",), "a project of RealityCapture", COLMAP_EXPORT),

@@ -181,7 +181,7 @@ def lose(folder: Path, data: dict) -> None:
     ("change", "words"),
     [
         (lose, "at least two frames"),
-        (lambda _, data: [data.pop(key) for key in ("fl_x", "fl_y")], "fl_x"),
+        (lambda _, data: [data.pop(key) for key in ("fl_x", "fl_y")], "no focal length.*--fov"),
         (lambda _, data: data.pop("frames"), "an object with a list 'frames'; got with fl_x"),
         (lambda _, data: data.update(Frames=data.pop("frames")), "Names are in small letters"),
         (lambda _, data: data.update(frames={}), "an object with a list 'frames'"),
@@ -689,3 +689,18 @@ def test_hidden_files_that_macos_leaves_beside_images_are_none(tmp_path):
         image.with_name(f"._{image.name}").write_bytes(b"Mac OS X")
     capture = Capture.open(folder)
     assert len(capture) == 4 and "capture.skipped" not in [note.code for note in capture.notes]
+
+
+def test_a_transforms_json_without_a_focal_length_takes_a_typed_one(tmp_path):
+    folder = transforms(tmp_path / "scan")
+    data = json.loads((folder / "transforms.json").read_text())
+    for entries in (data, *data["frames"]):
+        for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y"):
+            entries.pop(key, None)
+    (folder / "transforms.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=r"no focal length in its EXIF.*--K.*--fov"):
+        Capture.open(folder)
+    frames = Capture.open(folder, K=K).frames
+    assert len(frames) == 4
+    np.testing.assert_allclose(frames[1].K, K)
+    np.testing.assert_allclose(frames[1].E, TRUE[1], atol=1e-6)
