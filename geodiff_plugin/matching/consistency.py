@@ -250,5 +250,4 @@ def _mean_precision(matches: Matches, least_deviation: float) -> Tensor:
     if matches.deviation is None:
         return torch.ones_like(matches.confidence)
     precision = matches.deviation.clamp_min(least_deviation) ** -2 * matches.confidence.clamp_min(1.0)
-    precision = torch.where(matches.confidence > 0, precision, torch.zeros_like(precision))
-    return window_mean(precision, KNOWN_REACH) / ENOUGH_KNOWN
+    return window_mean(precision * (matches.confidence > 0), KNOWN_REACH) / ENOUGH_KNOWN

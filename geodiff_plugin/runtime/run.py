@@ -196,14 +196,15 @@ class GuidedRun:
         """Guide one step: what the scheduler's step gets instead of ``output`` and ``z_t (B, C, h, w)``."""
         schedule = self.schedule
         assert schedule is not None  # of begin
-        level, is_last = noise_level(self.pipe.scheduler, timestep), schedule.is_last(self._step)
+        is_last = schedule.is_last(self._step)
         latent_is_read = self._reads_latents or not is_last
-        estimate = StepEstimate(self._codec, level, output, z_t, self._tap, latent_is_read)
         if self._step == 0:
-            self._first_output = estimate.output
+            self._first_output = output[:, self.prior.depth_channels]
         inputs = StepInputs(output, z_t)  # unchanged, for the stock step bit for bit
         self._results[-1] = None
         if rounds := schedule.steps[self._step]:
+            level = noise_level(self.pipe.scheduler, timestep)
+            estimate = StepEstimate(self._codec, level, output, z_t, self._tap, latent_is_read)
             trajectory = self._trajectory()
             trajectory.step = self._step, self._timesteps[self._step]
             with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
