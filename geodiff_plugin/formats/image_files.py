@@ -176,7 +176,9 @@ class _Finder:
                 if os.path.isfile(path) and path.suffix.lower() in IMAGES:
                     return _Found(path, start == 0)
             for folder in self._folders:
-                alike = self._stems(folder.joinpath(*parts[start:-1])).get(_stem(parts[-1]), [])
+                of_stem = self._stems(folder.joinpath(*parts[start:-1]))
+                # OpenSfM adds a suffix to those that it undistorts: NAME.jpg.jpg.
+                alike = of_stem.get(_stem(parts[-1]), []) or of_stem.get(parts[-1].lower(), [])
                 if len(alike) == 1:
                     return _Found(alike[0], False)
         return _Found(None, False)

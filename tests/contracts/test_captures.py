@@ -398,6 +398,8 @@ def test_distorted_images_do_not_stand_in_for_the_undistorted_ones_of_opensfm(tm
     folder = opensfm(tmp_path / "scan").path
     (folder / "undistorted").mkdir()
     shutil.copytree(folder / "images", folder / "undistorted" / "images")
+    for image in list((folder / "undistorted" / "images").iterdir()):
+        image.rename(image.with_name(f"{image.name}.png"))  # as OpenSfM names them
     shutil.copy(folder / "reconstruction.json", folder / "undistorted")
     frames = Capture.open(folder / "undistorted").frames
     assert {frame.image.parent for frame in frames} == {folder / "undistorted" / "images"}
