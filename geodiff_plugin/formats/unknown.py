@@ -165,7 +165,8 @@ def refuse_foreign(source: Path) -> None:
 
 def refuse_unknown(source: Path, formats: Sequence[CaptureFormat]) -> NoReturn:
     """Refuse a path that no reader recognises: what was looked for, what is there, and what comes nearest."""
-    expected = ", ".join(each.summary for each in formats)
+    *others, last = (each.summary for each in formats)
+    expected = f"{', '.join(others)} or {last}"
     if source.is_file():
         check_file(source, "PATH", expected)  # what failed downloads leave has a cure of its own
         bad_value("PATH", expected, f"{source}, which is none of these")
