@@ -125,7 +125,7 @@ def _of_the_result() -> Iterator[Compiled]:
     median = "*fp32 *fp32 *fp32 *fp32 *fp32 i32 i32"
     yield Compiled("median of votes", result.median_kernel, median, sizes, result.WARPS)
     sizes = {"SPREAD": True, "PRIOR": 2, "PIXELS": result.PIXELS}
-    confidence = 6 * "*fp32 " + "i32"
+    confidence = 7 * "*fp32 " + "i32"
     yield Compiled("confidence", result.confidence_kernel, confidence, sizes, 4)
     sizes = {"CHANNELS": 3, "PIXELS": result.PIXELS}
     yield Compiled("warp", result.warp_kernel, "*fp32 *fp32 *fp32 *fp32 *i1 i32 i32 i32 i32", sizes, 4)
