@@ -136,10 +136,10 @@ class GuidedCall(_Stock):
         # Channels last, as the stock call reads pictures; with given latents Marigold does not accept it.
         layout = torch.channels_last if call["latents"] is None else torch.contiguous_format
         call["image"] = lefts_01.contiguous(memory_format=layout)
-        codec = MapCodec(self, prior, self._processing_grid(call, device), tiny)
         guidance.check_left_images(lefts_01)
         evidence = Beside(lambda: _prepared(guidance, lefts_01), device, own_stream=True)
         try:
+            codec = MapCodec(self, prior, self._processing_grid(call, device), tiny)
             if prior.takes_prompt and call.get("prompt_depth") is None:
                 call["prompt_depth"] = depth_prompt(evidence.result(), guidance.config)
             run = GuidedRun(codec, guidance, evidence.result, call, rounds, unlocked)
