@@ -16,7 +16,7 @@ from geodiff_plugin._camera_checks import (
     check_intrinsics_fit,
     check_pose,
 )
-from geodiff_plugin._checks import bad_value, refuse, warn
+from geodiff_plugin._checks import bad_value, noted, refuse, warn
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.guidance import GeometryGuidance, assumed_centre
 from geodiff_plugin.evidence.prepare import cleaned
@@ -42,7 +42,7 @@ from geodiff_plugin.formats.recordings import both_halves
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
 from geodiff_plugin.jobs.options import DepthOptions, unique_names
 from geodiff_plugin.jobs.taken import fitting_rig
-from geodiff_plugin.messages import Message
+from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.types import Distortion, Rig
 
 Size = tuple[int, int]
@@ -96,10 +96,11 @@ def read_pair(
         others = list(views.items())[len(first) :]
         images = [*first, *(_read_view(path, name, as_stored) for name, path in others)]
     sizes = [(image.shape[1], image.shape[0]) for image in images]
-    if options.estimate_pose:
-        cameras = _cameras_without_poses(options, sizes)
-    else:
-        cameras = _cameras_with_poses(options, images, names, of_files=frames is None)
+    with noted() as warned:  # of the calibration; what forbids trust in it forbids trust in the result
+        if options.estimate_pose:
+            cameras = _cameras_without_poses(options, sizes)
+        else:
+            cameras = _cameras_with_poses(options, images, names, of_files=frames is None)
     lenses = lenses_of(options, cameras.rig)
     images = [pinhole(*each, config) for each in zip(images, cameras.Ks, lenses, strict=False)]
     known: dict[str, Any] = {"cropped": options.cropped}
@@ -113,6 +114,8 @@ def read_pair(
         rig = replace(guidance.rigs[0], size_left=sizes[0], size_right=sizes[1], source="estimated")
     else:
         rig, guidance = cameras.rig, _posed_guidance(options, images, cameras, known)
+    doubts = [message for message in warned if message.forbids_trust]
+    guidance.warned = list(distinct(doubts, guidance.warned))
     undistorted_any = any(lens is not None for lens in lenses)
     if "colmap" in options.export and not undistorted_any:  # before the work that it would lose
         check_colmap_names(unique_names(options.photographs().values()))

@@ -9,6 +9,8 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import noted
+from geodiff_plugin.jobs.options import DepthOptions
+from geodiff_plugin.jobs.reading import read_pair
 from geodiff_plugin.jobs.taken import fitting_rig, off_lines_px
 from tests.contracts.calibrations import read_texts
 
@@ -142,3 +144,20 @@ def test_the_distance_off_a_line_is_in_pixels(tmp_path):
 def test_a_file_whose_cameras_cannot_be_read_stays_one_of_rectified_pictures(tmp_path):
     entries = json.loads(opencv()) | {"D1": [0.1, 0.2, 0.3]}
     assert read_texts(tmp_path, json.dumps(entries)).as_taken is None
+
+
+def test_a_doubted_unit_of_a_file_forbids_trust_in_the_command_too(pictures, tmp_path):
+    """As a translation that counts the squares of a board, read for ``geodiff depth``."""
+    entries = json.loads(opencv())
+    cameras = {name: entries[name] for name in ("K1", "K2", "D1", "D2", "R")}
+    unit = 40.0  # 3.2 "metres"
+    text = json.dumps(cameras | {"T": [unit * x for x in entries["T"]]})
+    (tmp_path / "calib.json").write_text(text)
+    for side, picture in zip(("left", "right"), pictures["taken"], strict=True):
+        cv2.imwrite(str(tmp_path / f"{side}.png"), (picture * 255).astype(np.uint8))
+    options = DepthOptions(
+        left=tmp_path / "left.png", right=tmp_path / "right.png", calib=(tmp_path / "calib.json",)
+    )
+    with pytest.warns(UserWarning, match="does not say its unit"):
+        inputs = read_pair(options)
+    assert "calibration.assumed-metres" in [message.code for message in inputs.guidance.warned]
