@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from geodiff_plugin._checks import bad_value
+from geodiff_plugin._checks import bad_value, refuse
 
 #: Letters of numpy's types for those of PCD.
 TYPES = {"F": "f", "U": "u", "I": "i"}
 HEAD = re.compile(rb"[\s\S]{0,4000}?^DATA[ \t]+(\w+)[ \t]*\r?\n", re.MULTILINE)
+DAMAGED = "The compressed numbers are damaged."
 CURE = "Is it cut off, or another format?"
 #: Sizes of the compressed and of the plain numbers, before the compressed ones.
 SIZES_BYTES = 8
@@ -82,7 +83,7 @@ def _compressed(body: bytes, layout: _Layout) -> np.ndarray:
     """All numbers of a field stand together, one field after the other."""
     packed, size = (int(number) for number in np.frombuffer(body, "<u4", 2))
     if size != layout.points * layout.row.itemsize:
-        raise ValueError(size)
+        refuse(DAMAGED)
     plain = _decompressed(body[SIZES_BYTES : SIZES_BYTES + packed], size)
     columns, start = {}, 0
     for field in layout.row.names or ():
@@ -111,9 +112,9 @@ def _decompressed(data: bytes, size: int) -> bytes:
         at += 1
         start, length = len(plain) - distance, length + 2
         if start < 0:
-            raise ValueError(distance)
+            refuse(DAMAGED)
         pattern = bytes(plain[start : start + length])  # shorter where the copy overlaps itself
         plain += (pattern * (length // len(pattern) + 1))[:length]
     if len(plain) != size:
-        raise ValueError(len(plain))
+        refuse(DAMAGED)
     return bytes(plain)
