@@ -856,7 +856,6 @@ MUTANTS = [
     ),
     *of(
         "scale/search_kernels.py",
-        ("points.BASIN_KEEP, 0.0)", "1.0, 0.0)"),
         ("reach / (grid - 1) * (2 if last else 1)", "reach / (grid - 1) * 2"),
         tests=(f"{KERNELS}search.py",),
     ),
