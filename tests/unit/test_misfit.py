@@ -1,6 +1,7 @@
 """What matches that miss the cameras add to the expected error, and what they take from confidence."""
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -8,7 +9,9 @@ import pytest
 import torch
 from scipy.stats import norm
 
+from geodiff_plugin._threads import Beside
 from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.matching.rows import RowMatches
 from geodiff_plugin.result.indicators import indicators_of
 from geodiff_plugin.result.misfit import NO_MISFIT, Misfit, expected_error, misfit_of, share_left
 from geodiff_plugin.types import CameraView, Indicators, PosedViews, PoseReport
@@ -132,6 +135,12 @@ def test_the_indicators_of_a_run_hold_the_worst_view_in_pixels_of_the_left_image
     pose = PoseReport(
         "refined", (), (), straightened_px=(0.5, 1.5), behind_px=2.0, depth_spread=0.2, scale_spread=0.1
     )
+    pose = replace(pose, exchangeable=0.3, moved=0.2, bars=0.1)
     native = PosedViews(left, views, torch.from_numpy(K))
     found = indicators_of(Evidence(native, native, None, None, pose=pose), {})
     assert (found.straightened_px, found.behind_px, found.depth_spread) == (1.5, 4.0, 0.2)
+    assert (found.exchangeable, found.moved, found.bars) == (0.3, 0.2, 0.1)
+    matched = RowMatches(left, left, left, left, torch.tensor(0.1), shear=0.01, occlusion=-0.5)
+    rows = Beside(lambda: matched, torch.device("cpu"))
+    found = indicators_of(Evidence(native, native, None, None, rows=rows), {})
+    assert (found.occlusion, found.shear) == (-0.5, pytest.approx(0.01 * 20 / 1664))
