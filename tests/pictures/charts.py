@@ -121,6 +121,12 @@ CHARTS = (
         (Column(3), Column(4), Column(7)),
     ),
     Chart("results-trust", 4, PROMISED, PROMISES),
+    Chart(
+        "results-trust",
+        5,
+        "Shares that were not trusted, and that got a warning or were not trusted",
+        (Column(6), Column(7)),
+    ),
     Chart("strength", 1, f"Errors by the prior's own error; {LOWER}", names=2, one_scale=False),
     Chart(
         "strength",
