@@ -1,6 +1,6 @@
 """A process that does some of the work of this one, whose threads share one lock of Python.
 
-A thread that draws and writes in the process that feeds a GPU gives up Python's lock some hundred times a
+A thread that draws and writes in the process that feeds a GPU gives up Python's lock dozens of times a
 result, and waits each time until the threads that launch kernels let it have it back.
 """
 
