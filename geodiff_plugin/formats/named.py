@@ -269,7 +269,7 @@ def _refuse_missing(named: Entries, arrays: Arrays) -> None:
     missing = [name for name in ("M1", "M2", *pose) if name not in named]
     if not missing:
         return
-    cure = "Where intrinsics and extrinsics are several files, give all (left, right, pose); rename what has "
+    cure = "Where intrinsics and extrinsics lie in several files, give all of them; rename what has "
     cure += "other names, or give K and E of the pair (--K, --K-right, --E)."
     if {"M1", "M2"} <= set(missing) and ("M" in named or any(_is_camera(key) for key, _ in arrays)):
         cure = "It is of one camera: give the stereo calibration, or K and E of the pair (--K, --E)."

@@ -130,7 +130,7 @@ def test_opencv_in_two_files(tmp_path):
     extrinsics = storage(tmp_path / "extrinsics.xml", R=POSE[:3, :3], T=POSE[:3, 3:])
     for pair in ((intrinsics, extrinsics), (extrinsics, intrinsics)):
         np.testing.assert_allclose(read_calibration(pair).T_right_from_left, POSE, atol=1e-12)
-    with pytest.raises(ValueError, match="no R, T.*give both"):
+    with pytest.raises(ValueError, match="no R, T.*give all of them"):
         read_calibration(intrinsics)
 
 
