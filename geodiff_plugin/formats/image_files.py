@@ -21,6 +21,9 @@ LEVELS_UP = 2
 MOST_DEEP = 5
 #: Files and folders that are looked at: listing a whole disk takes long.
 MOST_LISTED = 50_000
+#: A name that is not found whole is looked for by so many of its last parts at most: no folders of images are
+#: nested deeper, and a hostile name may have thousands.
+MOST_PARTS = 32
 #: So many of the images must be found in one go, as a share: single ones may be others of the same name.
 LEAST_FOUND = 0.5
 #: Beginnings of the names of folders whose pictures are no photographs, but have their names.
@@ -170,7 +173,8 @@ class _Finder:
     def find(self, name: str) -> _Found:
         """The file of a name."""
         parts = _parts(name)
-        for start in range(len(parts)):
+        last_parts = range(max(1, len(parts) - MOST_PARTS), len(parts))
+        for start in (0, *last_parts) if parts else ():
             for folder in self._folders:
                 path = folder.joinpath(*parts[start:])
                 if os.path.isfile(path) and path.suffix.lower() in IMAGES:
