@@ -154,9 +154,9 @@ def test_a_further_posed_view_has_the_left_ones_k_unless_it_is_given(tmp_path):
     np.savetxt(tmp_path / "E.txt", E)
     poses = {"e": tmp_path / "E.txt", "view": (Path("v.png"),), "view_e": (tmp_path / "E.txt",)}
     Ks = {"k": tmp_path / "100.txt", "k_right": tmp_path / "110.txt"}
-    options = DepthOptions(**VIEWS, **poses, **Ks)
+    options, images = DepthOptions(**VIEWS, **poses, **Ks), [np.zeros((48, 64, 3))] * 3
     for given, focals in (({}, [100, 110, 100]), ({"view_k": (tmp_path / "120.txt",)}, [100, 110, 120])):
-        found = _cameras_with_poses(replace(options, **given), [np.zeros((48, 64, 3))] * 3, None, of_files=False)
+        found = _cameras_with_poses(replace(options, **given), images, None, of_files=False)
         assert [K[0, 0] for K in found.Ks] == focals
 
 
