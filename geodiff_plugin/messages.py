@@ -204,7 +204,7 @@ MESSAGES: dict[str, MessageKind] = {
         forbids_trust=True,
     ),
     "calibration.as-taken": MessageKind(
-        "The pictures are taken to be as the cameras took them",
+        "The pictures are used as unrectified ones",
         cause="The calibration describes pictures as taken and rectified ones, and matches fit the former.",
         cure="Nothing; if the pictures are rectified, give a file of P1 and P2 alone.",
     ),

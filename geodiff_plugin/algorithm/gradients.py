@@ -52,15 +52,15 @@ class FiniteWatch:
         # The least and the largest value are finite if all are: one operation tells both.
         self._extremes.append(torch.stack(tensor.detach().float().aminmax()))
 
-    def check(self, prior: Any) -> None:
-        """Raise ``InputError`` on the first tensor that was not finite, of a pipeline with a ``dtype``."""
+    def check(self, pipe: Any) -> None:
+        """Raise ``InputError`` on the first tensor of a pipeline's run that was not finite."""
         if not self._extremes:
             return
         finite = torch.stack(self._extremes).cpu().isfinite().all(1)
         if finite.all():
             return
         name, step = self._names[int((~finite).nonzero()[0])]
-        short = str(prior.dtype).removeprefix("torch.")  # which a pipeline looks for in all of its layers
+        short = str(pipe.dtype).removeprefix("torch.")  # read here, as stock walks all layers for it
         cure = "Load the prior with dtype=torch.bfloat16 or torch.float32."
         if short != "float16":
             cure = "Are all weights of the prior finite?"

@@ -285,7 +285,7 @@ class OutFolder:
         return HeldPlace(self.path, self._target, self._staging)
 
     def write(self, fill: Callable[[Path], Result]) -> Result:
-        """``HeldPlace.write``."""
+        """Write into its place, as ``HeldPlace.write`` does."""
         return self.place.write(fill)
 
 

@@ -510,9 +510,9 @@ REMARKS = (
         _prior_exchanged,
         lambda found: (
             "The prior takes near for far (rank correlation with the matches "
-            f"{found.rank_correlation:+.2f}), and the matches show that it is wrong: is a map that was given "
-            "of this picture, and in the space that was named (--space)? Where nothing is matched the depth "
-            "follows the prior."
+            f"{found.rank_correlation:+.2f}), and the matches show that it is wrong. If you gave a depth "
+            "map: is it of this picture, and in the space that --space names? Where nothing is matched the "
+            "depth follows the prior."
         ),
     ),
     Rule(
