@@ -14,7 +14,6 @@ import re
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -345,7 +344,7 @@ def _capture_of(models: Iterable[Files], path: Path, images_at: Path | None) -> 
         posed = replace(frame, E=np.linalg.inv(image.T), points=seen.get(image.number))
         return Candidate(posed, model.camera(image.camera))
 
-    candidates = [images.candidate(name, partial(build, image=model.images[name])) for name in images.names]
+    candidates = images.candidates(build, (model.images[name] for name in images.names))
     return Layout("COLMAP model", None, candidates, as_stored=True, notes=(*notes, *images.notes))
 
 

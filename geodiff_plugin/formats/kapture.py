@@ -6,7 +6,6 @@ Source: ``kapture_format.adoc`` of naver/kapture: poses are world-to-device, cam
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +58,8 @@ def _kapture(folder: Path, images_at: Path | None) -> Layout:
     rig_of = {sensor: (rig, T_sensor_from_rig) for (rig, sensor), T_sensor_from_rig in rigs.items()}
     records = _rows(folder / "records_camera.txt")
 
-    def build(frame: CaptureFrame, time: str, device: str) -> Candidate:
+    def build(frame: CaptureFrame, record: list[str]) -> Candidate:
+        time, device, *_ = record
         camera = cameras.get(device, f"sensor {device} is not in sensors.txt")
         if isinstance(camera, str):
             raise InputError(camera)
@@ -73,11 +73,7 @@ def _kapture(folder: Path, images_at: Path | None) -> Layout:
 
     folders = [at for at in (folder / "records_data", folder) if at.is_dir()]
     images = Images([name for _, _, name, *_ in records], folders, folder, images_at)
-    pairs = zip(images.names, records, strict=True)
-    candidates = [
-        images.candidate(name, partial(build, time=time, device=device)) for name, (time, device, *_) in pairs
-    ]
-    return Layout("kapture", None, candidates, notes=images.notes)
+    return Layout("kapture", None, images.candidates(build, records), notes=images.notes)
 
 
 def _camera(device: str, words: list[str]) -> Camera | str | None:

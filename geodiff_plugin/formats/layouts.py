@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from geodiff_plugin.formats.rigs import Camera
 from geodiff_plugin.messages import Message
 from geodiff_plugin.types import Distortion
 
+#: What a file says of one image.
+Entry = TypeVar("Entry")
 #: Why a frame without its photograph is left out.
 NO_IMAGE = "no image file"
 #: Why a frame that was not placed is left out.
@@ -133,12 +136,19 @@ class Images:
         """The image of a name, if there is one."""
         return self._files[name]
 
-    def candidate(self, name: str, build: Callable[[CaptureFrame], Candidate]) -> Candidate:
-        """The candidate that ``build`` makes of a frame with its name and file, if there is one."""
+    def candidates(
+        self, build: Callable[[CaptureFrame, Entry], Candidate], entries: Iterable[Entry]
+    ) -> list[Candidate]:
+        """What ``build`` makes of the frame of each name that has a file, and of its entry; in order."""
+        return [self._candidate(*each, build) for each in zip(self.names, entries, strict=True)]
+
+    def _candidate(
+        self, name: str, entry: Entry, build: Callable[[CaptureFrame, Entry], Candidate]
+    ) -> Candidate:
         file, twice = self._files[name], name in self._used
         self._used.add(name)
         if file is not None and not twice:
-            return build_frame(CaptureFrame(file.stem, file), build)
+            return build_frame(CaptureFrame(file.stem, file), lambda frame: build(frame, entry))
         missing = Path(name.replace("\\", "/"))
         problem = "named twice; the first is used" if twice else self._problem
         return Candidate(CaptureFrame(missing.name, missing), None, problem)

@@ -54,6 +54,9 @@ FORTH = "(?:stereo|relative|lefttoright|ltor|l2r|1to2)?"
 BACK = "(?:righttoleft|rtol|r2l|2to1)"
 ROTATION = "(?:stereo)?(?:r|rot|rotation|om|rvec)(?:mat|matrix|vec|vector)?"
 TRANSLATION = "(?:stereo)?(?:t|tvec|trans|transl|translation)(?:mat|matrix|vec|vector)?"
+#: Lengths, whose names may end with their unit.
+T_FORTH, T_BACK = (f"{TRANSLATION}{way}{UNIT}?" for way in (FORTH, BACK))
+BASELINE = f"(?:stereo)?baseline{UNIT}?"
 
 
 def _of(words: str, number: int, side: str) -> str:
@@ -71,16 +74,16 @@ def _names(first: int) -> dict[str, str]:
         **{f"{name}1": _of(words, first, "left") for name, words in WORDS.items()},
         **{f"{name}2": _of(words, first + 1, "right") for name, words in WORDS.items()},
         "R": ROTATION + FORTH,
-        "T": f"{TRANSLATION}{FORTH}{UNIT}?",
+        "T": T_FORTH,
         "R_back": ROTATION + BACK,
-        "T_back": f"{TRANSLATION}{BACK}{UNIT}?",
+        "T_back": T_BACK,
         "E": "e|pose",
         "image_size": "imagesize|imgres|imgsize|size|resolution|imageshape",
         "image_width": "imagewidth|leftwidth|width",
         "image_height": "imageheight|leftheight|height",
         "M": WORDS["M"],
         "D": WORDS["D"],
-        "baseline": f"(?:stereo)?baseline{UNIT}?",
+        "baseline": BASELINE,
     }
 
 
@@ -98,8 +101,8 @@ COUNTS = {
     "R_back": (3, 9),
     "T_back": (3,),
 }
-#: Those that two parallel cameras may share, and those of which one may be many.
-FOR_BOTH = ("M", "D")
+#: Those that may differ between the files of single cameras; which of them is meant nobody says, so none is.
+MAY_DIFFER = ("M", "D", "image_size", *SIDES)
 #: What files of single cameras say of both images.
 SHARED = ("imagesize", "imagewidth", "imageheight")
 #: A left camera of number 0.
@@ -131,7 +134,7 @@ def _named(arrays: Arrays) -> Entries:
         if name == "baseline":
             fits = _in_metres(fits)
         differ = any(not np.array_equal(v, fits[0][1]) for _, v in fits[1:])
-        if differ and (name in FOR_BOTH or name in (*SIDES, "image_size")):
+        if differ and name in MAY_DIFFER:
             continue
         if differ:
             cure = "Keep those that belong to R and T; files of single cameras have no baseline."
@@ -160,25 +163,31 @@ def _units_a_metre(entries: Entries, length: float) -> float | None:
     """
     for key, value in entries.items():
         name = _squeezed(key)
-        if re.fullmatch(_names(1)["T"] + "|" + _names(1)["T_back"], name) and (unit := _unit_of_name(key)):
+        if re.fullmatch(f"{T_FORTH}|{T_BACK}", name) and (unit := _unit_of_name(key)):
             return unit
         if re.fullmatch("(?:length|world)?units?", name) and str(value).lower() in UNITS:
             return UNITS[str(value).lower()]
     numbers = {key: v.item() for key, v in entries.items() if isinstance(v, np.ndarray) and v.size == 1}
-    for key, number in numbers.items():
-        if re.fullmatch(_names(1)["baseline"], _squeezed(key)):
-            stated = _unit_of_name(key)
-            units = [
-                u
-                for u in (1e3, 1e2, 1.0)
-                if abs(length / u * (stated or 1.0) - number) <= SAME_LENGTH * number
-            ]
-            if units and (stated or units[0] != 1.0):
-                return units[0]
+    baselines = {key: number for key, number in numbers.items() if re.fullmatch(BASELINE, _squeezed(key))}
+    for key, number in baselines.items():
+        if (unit := _unit_by_baseline(length, number, _unit_of_name(key))) is not None:
+            return unit
     for key in numbers:
         if match := SQUARE.fullmatch(_squeezed(key)):
             unit = UNITS[match[1]]
             return unit if LIKELY_BASELINE_M[0] <= length / unit <= LIKELY_BASELINE_M[1] else None
+    return None
+
+
+def _unit_by_baseline(length: float, baseline: float, stated: float | None) -> float | None:
+    """Units a metre of the translation's ``length`` in which it is as long as the baseline beside it.
+
+    ``stated`` is the same of the baseline, if its name says its unit; else it is taken to be in metres, and
+    that both lengths are equal then says nothing.
+    """
+    for unit in (1e3, 1e2, 1.0):
+        if abs(length / unit * (stated or 1.0) - baseline) <= SAME_LENGTH * baseline:
+            return unit if stated or unit != 1.0 else None
     return None
 
 

@@ -8,9 +8,8 @@ alicevision/AliceVision. Both count pixels from the centre of the first one.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.files import read_text
 from geodiff_plugin.formats.image_files import files_of, image_folders
 from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout
-from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, rigid
+from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, transform
 
 #: OpenMVG's cameras: OpenCV's model, and the entry with the coefficients.
 OPENMVG_LENSES = {
@@ -50,7 +49,7 @@ def _opencv_order(numbers: Sequence[float]) -> list[float]:
 
 def _pose(rotation: np.ndarray, centre: Any) -> np.ndarray:
     """Camera-to-world, of a world-to-camera rotation and the place of the camera."""
-    return rigid(np.column_stack([rotation.T, array_of(centre, (3,), "center")]), "a pose")
+    return transform(rotation.T, array_of(centre, (3,), "center"), "a pose")
 
 
 def _with_most_poses(
@@ -85,7 +84,8 @@ def read_openmvg(path: Path, images_at: Path | None = None) -> Layout | None:
         E = pose and _pose(array_of(pose["rotation"], (3, 3), "rotation"), pose["center"])
         return Candidate(replace(frame, E=E), camera and _openmvg_camera(*camera))
 
-    return _layout("OpenMVG", file, names, [partial(build, view=view) for view in views], images_at)
+    images = Images(names, image_folders(file.parent, file.parent.parent), file, images_at)
+    return Layout("OpenMVG", None, images.candidates(build, views), notes=images.notes)
 
 
 def _flat(each: Entries) -> Entries:
@@ -120,9 +120,9 @@ def read_alicevision(path: Path, images_at: Path | None = None) -> Layout | None
         E = pose and _pose(array_of(pose["rotation"], (3, 3), "rotation").T, pose["center"])
         return Candidate(replace(frame, E=E), camera and _alicevision_camera(camera, version))
 
-    views = data["views"]
-    builds = [partial(build, view=view) for view in views]
-    return _layout("AliceVision", file, [str(view["path"]) for view in views], builds, images_at)
+    views, folders = data["views"], image_folders(file.parent, file.parent.parent)
+    images = Images([str(view["path"]) for view in views], folders, file, images_at)
+    return Layout("AliceVision", None, images.candidates(build, views), notes=images.notes)
 
 
 def _alicevision_camera(entries: Entries, version: tuple[int, ...]) -> Camera:
@@ -154,16 +154,3 @@ def _focals_px(entries: Entries, version: tuple[int, ...], size: tuple[int, int]
     if version < (1, 2, 5):
         return px, px / ratio
     return (px, px * ratio) if version < (1, 2, 11) else (px / ratio, px)
-
-
-def _layout(
-    kind: str,
-    file: Path,
-    names: Sequence[str],
-    builds: Sequence[Callable[[CaptureFrame], Candidate]],
-    images_at: Path | None,
-) -> Layout:
-    images = Images(names, image_folders(file.parent, file.parent.parent), file, images_at)
-    pairs = zip(images.names, builds, strict=True)
-    candidates = [images.candidate(name, build) for name, build in pairs]
-    return Layout(kind, None, candidates, notes=images.notes)

@@ -11,7 +11,6 @@ import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -23,7 +22,7 @@ from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.formats.files import parse_xml, read_text, stored_size
 from geodiff_plugin.formats.image_files import IMAGE_FOLDERS, files_of, image_folders
 from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout
-from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, pose_of, rigid
+from geodiff_plugin.formats.rigs import Camera, array_of, central_camera, intrinsics, pose_of, rigid
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.messages import Message
 
@@ -118,8 +117,7 @@ def _metashape(file: Path, root: Element, images_at: Path | None) -> Layout:
         E[:3, 3] *= scale
         return Candidate(replace(frame, E=E), sensor)
 
-    pairs = zip(images.names, cameras, strict=True)
-    candidates = [images.candidate(name, partial(build, camera=camera)) for name, camera in pairs]
+    candidates = images.candidates(build, cameras)
     notes = list(images.notes)
     if others:
         said = f"The chunk or component with most placed cameras, {part.placed()}, is used"
@@ -184,7 +182,7 @@ def _opensfm(file: Path, data: list[Entries], images_at: Path | None) -> Layout:
         T = pose_of(turn, shot["translation"])
         return Candidate(replace(frame, E=np.linalg.inv(T)), _opensfm_camera(part["cameras"][shot["camera"]]))
 
-    candidates = [images.candidate(name, partial(build, shot=shot)) for name, shot in shots]
+    candidates = images.candidates(build, (shot for _, shot in shots))
     notes = list(images.notes)
     if len(data) > 1:
         sizes = ", ".join(str(len(each["shots"])) for each in data if each is not part)
@@ -249,18 +247,11 @@ def _bundler(file: Path, counts: str, lines: Iterator[str], images_at: Path | No
         R, t = (array_of(" ".join(part).split(), (-1,), "R, t") for part in (rows[1:4], rows[4:5]))
         T = np.vstack([np.column_stack([R.reshape(3, 3), t]), (0, 0, 0, 1)])
         E = np.linalg.inv(rigid(T, "R, t")) @ OPENGL_FROM_OPENCV
-        return Candidate(replace(frame, E=E), _central(frame, f, (k1, k2, 0.0, 0.0)))
+        camera = central_camera(f, f, stored_size(frame.image, frame.name), (k1, k2, 0.0, 0.0))
+        return Candidate(replace(frame, E=E), camera)
 
     blocks = [[next(lines, "") for _ in range(5)] for _ in names]
-    pairs = zip(images.names, blocks, strict=True)
-    candidates = [images.candidate(name, partial(build, rows=rows)) for name, rows in pairs]
-    return Layout("Bundler", None, candidates, notes=images.notes)
-
-
-def _central(frame: CaptureFrame, f: float, coefficients: tuple[float, ...]) -> Camera:
-    """A camera whose principal point is the middle of its image."""
-    size = stored_size(frame.image, frame.name)
-    return Camera(intrinsics(f, f, (size[0] - 1) / 2, (size[1] - 1) / 2), size, coefficients)
+    return Layout("Bundler", None, images.candidates(build, blocks), notes=images.notes)
 
 
 def read_nvm(path: Path, images_at: Path | None = None) -> Layout | None:
@@ -285,8 +276,8 @@ def _nvm(file: Path, lines: Iterator[str], images_at: Path | None) -> Layout:
         turn = Rotation.from_quat([qx, qy, qz, qw]).inv()
         # VisualSFM straightens by r (1 + k r^2); this is its inverse, as a series.
         lens = (-k, 3 * k**2, 0.0, 0.0, -12 * k**3)
-        return Candidate(replace(frame, E=pose_of(turn, place)), _central(frame, f, lens))
+        camera = central_camera(f, f, stored_size(frame.image, frame.name), lens)
+        return Candidate(replace(frame, E=pose_of(turn, place)), camera)
 
-    pairs = zip(images.names, rows, strict=True)
-    candidates = [images.candidate(name, partial(build, words=row[-1])) for name, row in pairs]
+    candidates = images.candidates(build, (row[-1] for row in rows))
     return Layout("VisualSFM", None, candidates, notes=images.notes)

@@ -21,7 +21,7 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.files import read_matrix, read_npy, read_text
 from geodiff_plugin.formats.image_files import IMAGE_FOLDERS, files_of, image_folders, images_in
 from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout, build_frame
-from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, rigid
+from geodiff_plugin.formats.rigs import Camera, array_of, central_camera, intrinsics, rigid, transform
 from geodiff_plugin.formats.storage import text_of_npz
 
 #: Entries of every camera of 3D Gaussian splatting's ``cameras.json``.
@@ -53,18 +53,11 @@ def _splat_cameras(file: Path, data: list[Entries], images_at: Path | None) -> L
 
     def build(frame: CaptureFrame, entries: Entries) -> Candidate:
         R = array_of(entries["rotation"], (3, 3), "rotation")
-        E = rigid(np.column_stack([R, array_of(entries["position"], (3,), "position")]), "a pose")
+        E = transform(R, array_of(entries["position"], (3,), "position"), "a pose")
         size = entries["width"], entries["height"]
-        return Candidate(replace(frame, E=E), _central(entries["fx"], entries["fy"], size))
+        return Candidate(replace(frame, E=E), central_camera(entries["fx"], entries["fy"], size))
 
-    pairs = zip(images.names, data, strict=True)
-    candidates = [images.candidate(name, partial(build, entries=each)) for name, each in pairs]
-    return Layout("3D Gaussian splatting", None, candidates, notes=images.notes)
-
-
-def _central(fx: float, fy: float, size: tuple[int, int]) -> Camera:
-    """A camera whose principal point is the middle of its image."""
-    return Camera(intrinsics(fx, fy, (size[0] - 1) / 2, (size[1] - 1) / 2), size)
+    return Layout("3D Gaussian splatting", None, images.candidates(build, data), notes=images.notes)
 
 
 def read_llff(path: Path) -> Layout | None:
@@ -84,8 +77,8 @@ def read_llff(path: Path) -> Layout | None:
 
     def build(frame: CaptureFrame, row: np.ndarray) -> Candidate:
         down, right, back, place, (height, width, focal) = row[:15].reshape(3, 5).T
-        E = rigid(np.column_stack([right, down, -back, place]), "a pose")
-        return Candidate(replace(frame, E=E), _central(focal, focal, (int(width), int(height))))
+        E = transform(np.column_stack([right, down, -back]), place, "a pose")
+        return Candidate(replace(frame, E=E), central_camera(focal, focal, (int(width), int(height))))
 
     # In the order in which numpy sorted the names, as text.
     pairs = zip(sorted(images, key=lambda image: image.name), rows, strict=True)
@@ -108,7 +101,7 @@ def read_neus(path: Path) -> Layout | None:
     def build(frame: CaptureFrame, number: int) -> Candidate:
         P = array_of(matrices[f"world_mat_{number}"], (4, 4), f"world_mat_{number}")[:3]
         K, R, centre = cv2.decomposeProjectionMatrix(P * np.sign(np.linalg.det(P[:, :3])))[:3]
-        E = rigid(np.column_stack([R.T, centre[:3] / centre[3]]), "a pose")
+        E = transform(R.T, centre[:3] / centre[3], "a pose")
         return Candidate(replace(frame, E=E), Camera(K / K[2, 2]))
 
     candidates = [
@@ -138,9 +131,7 @@ def _sdfstudio(file: Path, data: Entries, images_at: Path | None) -> Layout:
         E = rigid(np.ravel(entries["camtoworld"]), "camtoworld")
         return Candidate(replace(frame, E=E), Camera(K, (data["width"], data["height"])))
 
-    pairs = zip(images.names, frames, strict=True)
-    candidates = [images.candidate(name, partial(build, entries=each)) for name, each in pairs]
-    return Layout("SDFStudio", None, candidates, notes=images.notes)
+    return Layout("SDFStudio", None, images.candidates(build, frames), notes=images.notes)
 
 
 def read_nerfies(path: Path) -> Layout | None:
@@ -162,7 +153,7 @@ def _nerfies_frame(frame: CaptureFrame, file: Path) -> Candidate:
     if missing:
         bad_value(f"the camera of {frame.name}", "one of Nerfies", f"no {', '.join(sorted(missing))}")
     R = array_of(entries["orientation"], (3, 3), "orientation")  # from the world to the camera
-    E = rigid(np.column_stack([R.T, array_of(entries["position"], (3,), "position")]), "a pose")
+    E = transform(R.T, array_of(entries["position"], (3,), "position"), "a pose")
     fx = float(entries["focal_length"])
     # The corner of the first pixel is at (0, 0).
     centre = array_of(entries["principal_point"], (2,), "principal_point") - 0.5

@@ -12,13 +12,11 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.files import parse_xml, read_text, stored_size
 from geodiff_plugin.formats.image_files import images_in
 from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Layout, build_frame
-from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, rigid
+from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, transform
 from geodiff_plugin.messages import Message
 
 NAMESPACE = "http://www.capturingreality.com/ns/xcr/1.1#"
@@ -81,7 +79,7 @@ def _frame(frame: CaptureFrame, entries: Entries) -> Candidate:
         return Candidate(frame, camera)
     R = array_of(entries["Rotation"].split(), (3, 3), "xcr:Rotation")
     place = array_of(entries["Position"].split(), (3,), "xcr:Position")
-    return Candidate(replace(frame, E=rigid(np.column_stack([R.T, place]), "xcr:Rotation")), camera)
+    return Candidate(replace(frame, E=transform(R.T, place, "xcr:Rotation")), camera)
 
 
 def _camera(entries: Entries, size: tuple[int, int]) -> Camera:
@@ -99,6 +97,5 @@ def _camera(entries: Entries, size: tuple[int, int]) -> Camera:
     k1, k2, k3, k4, t1, t2 = numbers
     if model not in LENSES or k4:
         bad_value("a lens of RealityScan", f"one of {', '.join(LENSES)} without k4", model, UNDISTORT)
-    return Camera(
-        K, size, (k1, k2, t2, t1, k3)
-    )  # its tangential coefficients change places in OpenCV's order
+    # Its tangential coefficients change places in OpenCV's order.
+    return Camera(K, size, (k1, k2, t2, t1, k3))

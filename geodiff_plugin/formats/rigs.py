@@ -175,6 +175,11 @@ def pose_of(turn: Rotation, place: Any) -> np.ndarray:
     return E
 
 
+def central_camera(fx: float, fy: float, size: Size, coefficients: tuple[float, ...] = ()) -> Camera:
+    """A camera whose principal point is the middle of its image."""
+    return Camera(intrinsics(fx, fy, (size[0] - 1) / 2, (size[1] - 1) / 2), size, coefficients)
+
+
 def resized(camera: Camera, size: Size, name: str, cure: str) -> Camera:
     """The camera at another resolution of the whole image, which messages name; a crop is refused."""
     width, height = camera.size or size

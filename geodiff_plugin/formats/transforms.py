@@ -172,10 +172,7 @@ def read_transforms(path: Path, images_at: Path | None = None) -> Layout | None:
         return None
     frames = list(nerf_frames(read_text(file, "PATH")))
     images = _images(frames, file, images_at)
-    candidates = [
-        images.candidate(name, partial(_build, entries=entries, folder=file.parent))
-        for name, entries in zip(images.names, frames, strict=True)
-    ]
+    candidates = images.candidates(partial(_build, folder=file.parent), frames)
     solved = any(key in entries for entries in frames for key in OF_COLMAP) or any(map(_is_scaled, frames))
     notes = (*_notes(file), *images.notes)
     return Layout(TRANSFORMS, None if solved else "m", candidates, as_stored=True, notes=notes)

@@ -240,9 +240,9 @@ def _nearest(folder: Path, formats: Sequence[CaptureFormat]) -> str:
     """The format of whose marks the most are there, if that is half of them."""
     best, said = (LEAST_MARKS, 0), ""
     for each in formats:
-        lacking = [_patterns(mark) for mark in each.marks if not _has(folder, mark)]
-        there = [_patterns(mark) for mark in each.marks if _has(folder, mark)]
-        files = sum("." in patterns[0] for patterns in there)  # say more than folders
+        there = [mark for mark in each.marks if _has(folder, mark)]
+        lacking = [_patterns(mark) for mark in each.marks if mark not in there]
+        files = sum("." in _patterns(mark)[0] for mark in there)  # say more than folders
         score = len(there) / len(each.marks), files
         if lacking and score > best:
             also = ", ".join(
