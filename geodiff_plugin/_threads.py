@@ -65,8 +65,9 @@ class Beside(Generic[T]):
 
     A guided call on CUDA makes its evidence like this, beside the network's first steps, which are not
     guided; in it the pose check, which keeps the CPU busy while the GPU matches; and after it the matches of
-    rows, which only the result asks for. The thread has the caller's context variables and takes no
-    gradients. On other devices both would compete for the same cores, so the function is called at once.
+    rows, which only the result asks for, and what the verdict asks of them. The thread has the caller's
+    context variables and takes no gradients. On other devices both would compete for the same cores, so the
+    function is called at once.
 
     Args:
         function: what is worked out.
@@ -111,9 +112,13 @@ class Beside(Generic[T]):
         return answer
 
     def close(self) -> None:
-        """Wait until the thread has ended, whether its answer was asked for or not."""
+        """Wait until its thread and those that its answer holds have ended, whether anybody asked or not."""
         if self._pool is not None:
             self._pool.shutdown(wait=True, cancel_futures=True)
+        if not self._answer.cancelled() and self._answer.exception() is None:
+            for part in _parts_of(self._answer.result()):
+                if isinstance(part, Beside):
+                    part.close()
 
 
 @functools.cache
@@ -125,15 +130,37 @@ def _stream_beside(device: torch.device) -> torch.cuda.Stream:
     return torch.cuda.Stream(device, priority=-1)
 
 
+def sent_to_cpu(tensor: Tensor) -> Callable[[], Tensor]:
+    """Ask the device for a tensor now; the function that is returned waits for it and gives it on the CPU.
+
+    It does not wait for what the stream of the caller is told in the meantime, as ``tensor.cpu()`` would.
+    """
+    if not tensor.is_cuda:
+        there = tensor.cpu()
+        return lambda: there
+    sent = tensor.to("cpu", non_blocking=True)
+    arrived = torch.cuda.current_stream(tensor.device).record_event()
+
+    def received() -> Tensor:
+        arrived.synchronize()
+        return sent
+
+    return received
+
+
 def tensors_of(value: object) -> Iterator[Tensor]:
     """The tensors of a record, of its parts, and of what these have worked out and kept."""
-    if isinstance(value, Tensor):
-        yield value
-        return
+    return (part for part in _parts_of(value) if isinstance(part, Tensor))
+
+
+def _parts_of(value: object) -> Iterator[object]:
+    """What a record, its parts, and what these have worked out and kept are made of in the end."""
     if is_dataclass(value):
         value = vars(value)
     if isinstance(value, Mapping):
         value = value.values()
     if isinstance(value, (tuple, list, ValuesView)):
         for part in value:
-            yield from tensors_of(part)
+            yield from _parts_of(part)
+    else:
+        yield value

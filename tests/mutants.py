@@ -699,8 +699,8 @@ MUTANTS = [
     ),
     *of(
         "matching/occlusion.py",
-        ("difference = at_near.max(1) - at_far.max(1)", "difference = at_far.max(1) - at_near.max(1)"),
-        ("beside = np.arange(-REACH_PX, REACH_PX + 1)", "beside = np.arange(1)"),
+        ("for end in (far, near - 1))", "for end in (near - 1, far))"),
+        ("beside = np.arange(-REACH_PX, REACH_PX + 2)", "beside = np.arange(2)"),
         ("(rise >= LEAST_RISE_PX) & as_wide", "rise >= LEAST_RISE_PX"),
         tests=(f"{UNIT}occlusion.py",),
     ),
@@ -755,8 +755,16 @@ MUTANTS = [
     ),
     *of(
         "matching/rows.py",
-        ("[image[:, ::-1] for image in images], -infinity", "[image[:, ::-1] for image in images], infinity"),
+        ("-infinity if mirrored else infinity", "infinity"),
         tests=(f"{UNIT}algorithm.py",),
+    ),
+    *of(
+        "matching/gaps.py",
+        ("self.first > 0) & (self.end < ", "self.first > 0) | (self.end < "),
+        ("LEAST_STEP_PX = 2.0", "LEAST_STEP_PX = 4.0"),
+        ("np.minimum(*gaps.ends", "np.maximum(*gaps.ends"),
+        ("np.searchsorted(full, empty) - 1", "np.searchsorted(full, empty)"),
+        tests=(f"{UNIT}gaps.py",),
     ),
     *of(
         "matching/consistency.py",
@@ -825,6 +833,8 @@ MUTANTS = [
         ("return context.run(function)", "return function()"),
         ("with torch.no_grad(), torch.cuda", "with torch.cuda"),
         ("shutdown(wait=True, cancel", "shutdown(wait=False, cancel"),
+        ("        arrived.synchronize()", "        pass"),
+        ("                    part.close()", "                    pass"),
         ("self._stream.record_event(), _stream_beside(device)", "None, _stream_beside(device)"),
         tests=(f"{UNIT}beside.py", "tests/integration/test_threads.py"),
     ),

@@ -28,7 +28,7 @@ class Evidence:
     matches: Matches | None  # aggregated, left-right checked, where a term asks
     points: Matches | None = None  # depths that the user knows, in the form of matches
     reliable: Matches | None = None  # ``matches`` as points for the search, where enough are reliable
-    rows: Beside[RowMatches | None] | None = None  # rows matched anew at the image's size, where act 3 asks
+    rows: Beside[RowMatches] | None = None  # of a rectified pair, at the image's size; act 3 asks for them
     pose: PoseReport | None = None  # how the poses fit
     warnings: tuple[Message, ...] = ()
 

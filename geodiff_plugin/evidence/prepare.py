@@ -14,7 +14,7 @@ from torch import Tensor
 
 import geodiff_plugin.matching as matching
 from geodiff_plugin._checks import InputError
-from geodiff_plugin._threads import Beside, leaves_cpu_free
+from geodiff_plugin._threads import Beside, leaves_cpu_free, sent_to_cpu
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.inputs import Inputs
@@ -82,11 +82,11 @@ def prepare_evidence(
     if points is not None:
         known_points, left_out = matching.points_to_matches(points, native.K_left, native.size, grid.size)
     if native.views and (config.search == "volume" or needs_matches):
-        pictures = pictures_beside(native) if needs_matches and config.crisp else None
+        pictures = rectified_pictures(native) if needs_matches and config.crisp else None
         volume = matching.build_cost_volume(native, depth_range=config.depth_range, config=config)
         if needs_matches:
             matches = matching.match_volume(volume)
-            rows = None if pictures is None else rows_beside(pictures, matches, known_points)
+            rows = rows_beside(pictures, matches, known_points)
         if matching.inverse_pose_preferred(native, matches):
             warnings.append(INVERSE)
     if left_out:
@@ -107,27 +107,20 @@ def prepare_evidence(
     return evidence
 
 
-def pictures_beside(native: PosedViews) -> Beside[RowPictures | None]:
-    """What the rows of a rectified pair are matched in, made by the CPU while a GPU matches on the grid."""
-    return Beside(lambda: rectified_pictures(native), native.left_01.device)
-
-
 def rows_beside(
-    pictures: Beside[RowPictures | None], matches: Matches, points: Matches | None
-) -> Beside[RowMatches | None]:
+    pictures: RowPictures | None, matches: Matches, points: Matches | None
+) -> Beside[RowMatches] | None:
     """The rows of a rectified pair, matched by the CPU while a GPU goes on: act 3 is the first to ask.
 
     They are sought up to the nearest of the matches and known points; ``None`` without such a pair.
     """
+    if pictures is None:
+        return None
     nearest = matches.inverse_depth.amax()
     if points is not None:
         nearest = torch.maximum(nearest, points.inverse_depth.amax())
-
-    def matched() -> RowMatches | None:
-        pair = pictures.result()
-        return None if pair is None else match_rows(pair, pair.shift_px(float(nearest)))
-
-    return Beside(matched, matches.inverse_depth.device)
+    received = sent_to_cpu(nearest)
+    return Beside(lambda: match_rows(pictures, pictures.shift_px(float(received()))), pictures.device)
 
 
 def _read_back(evidence: Evidence) -> None:

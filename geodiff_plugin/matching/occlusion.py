@@ -12,6 +12,8 @@ import math
 import cv2
 import numpy as np
 
+from geodiff_plugin.matching.gaps import Gaps
+
 #: Smaller rises are those of slanted surfaces, pixels.
 LEAST_RISE_PX = 4.0
 #: An occlusion is as wide as the shift rises, up to this share of the rise.
@@ -28,31 +30,27 @@ FEWEST = 60
 BLUR_PX = 0.8
 
 
-def occlusion_order(grey: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> float:
+def occlusion_order(grey: np.ndarray, shift: np.ndarray, gaps: Gaps) -> float:
     """Mean over occlusions of +1 where the picture changes at the nearer end, and -1 at the farther one.
 
     Args:
         grey: ``(H, W)`` uint8, the left picture of a rectified pair; the right camera stands to the right.
         shift: ``(H, W)`` pixels, larger where it is nearer.
-        matched: ``(H, W)`` bool, where the shift is known; occlusions are gaps.
+        gaps: where the shift is not known; some of them are occlusions.
 
     Returns:
         In [-1, 1], above 0 where near hides far; NaN for too few occlusions.
     """
-    width = grey.shape[1]
-    columns = np.where(matched, np.arange(width), 2 * width)
-    next_known = np.minimum.accumulate(columns[:, ::-1], axis=1)[:, ::-1]
-    row, far = np.nonzero(matched[:, :-1] & ~matched[:, 1:])
-    near = next_known[row, far + 1]
-    inside = (far >= REACH_PX) & (near < width - REACH_PX - 1)
-    row, far, near = row[inside], far[inside], near[inside]
+    far, near = gaps.first - 1, gaps.end
+    inside = (far >= REACH_PX) & (near < grey.shape[1] - REACH_PX - 1)
+    row, far, near = gaps.row[inside], far[inside], near[inside]
     rise = shift[row, near] - shift[row, far]
     as_wide = np.abs(near - far - 1 - rise) < np.maximum(AS_WIDE_PX, AS_WIDE * rise)
     occluded = (rise >= LEAST_RISE_PX) & as_wide
     row, far, near = row[occluded, None], far[occluded, None], near[occluded, None]
-    steps = np.abs(np.diff(cv2.GaussianBlur(grey, (0, 0), BLUR_PX).astype(np.float32), axis=1))
-    beside = np.arange(-REACH_PX, REACH_PX + 1)
-    at_far, at_near = steps[row, far + beside], steps[row, near - 1 + beside]
-    difference = at_near.max(1) - at_far.max(1)
+    blurred = cv2.GaussianBlur(grey, (0, 0), BLUR_PX)
+    beside = np.arange(-REACH_PX, REACH_PX + 2)  # steps from each of these pixels to the next
+    at_far, at_near = (blurred[row, end + beside].astype(np.float32) for end in (far, near - 1))
+    difference = np.abs(np.diff(at_near)).max(1) - np.abs(np.diff(at_far)).max(1)
     clear = np.abs(difference) > LEAST_DIFFERENCE
     return float(np.sign(difference[clear]).mean()) if clear.sum() >= FEWEST else math.nan

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -12,9 +12,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._threads import Beside, sent_to_cpu
 from geodiff_plugin.geometry import image_size, is_rectified, resize_image, size_within
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import known_share
+from geodiff_plugin.matching.gaps import fill_background, find_gaps, hidden_gaps
 from geodiff_plugin.matching.matches import Matches
 from geodiff_plugin.matching.occlusion import occlusion_order
 from geodiff_plugin.matching.uprights import certain_shear, upright_lines
@@ -34,16 +36,18 @@ MIN_SHIFT_PX = 0.3
 MAX_SHIFT = 0.3
 #: Most pixels of the pictures that are matched; larger ones are made smaller.
 MOST_PIXELS = 600_000
-#: The least step of shift that hides a strip of the farther surface, pixels: below it, matches differ by
-#: chance.
-LEAST_STEP_PX = 2.0
-#: How much wider than its step of shift a hidden strip may seem, pixels: matches end before an edge.
-SLACK_PX = 2.0
 #: Confidence of what is put into a hidden strip where the matches around it know enough: it is a guess that
 #: the farther surface goes on, and on a blank wall the end of the strip is one as well.
 HIDDEN_CONFIDENCE = 0.8
 #: A match in a hidden strip is kept from this confidence on.
 LEAST_KEPT = 0.05
+
+
+class RowChecks(NamedTuple):
+    """What the rows of a rectified pair say about its pictures."""
+
+    shear: float  # of the right one along its rows, pixels per row, as far as it is certain (NaN: unknown)
+    occlusion: float  # [-1, 1], below 0 where what is matched as far hides what is near (NaN: unknown)
 
 
 class RowMatches(NamedTuple):
@@ -54,8 +58,7 @@ class RowMatches(NamedTuple):
     hidden: Tensor  # 1 in a gap between two that the right view cannot see (``hidden_gaps``)
     filled: Tensor  # 1 in another gap between two; the shift of a gap is that of its farther end
     baseline_m: Tensor  # () distance of the cameras, metres, on the CPU
-    shear: float = math.nan  # of the right picture along its rows, pixels per row, as far as it is certain
-    occlusion: float = math.nan  # [-1, 1], below 0 where what is matched as far hides what is near
+    checks: Beside[RowChecks]  # still being worked out while the maps are used: the verdict asks
 
     @property
     def certain(self) -> Tensor:
@@ -66,12 +69,11 @@ class RowMatches(NamedTuple):
 class RowPictures(NamedTuple):
     """A rectified pair as its rows are matched; mirrored if its second view is on the left."""
 
-    left: np.ndarray  # (H, W) uint8, grey levels
-    right: np.ndarray
-    lines: np.ndarray  # (N, 4), ``upright_lines`` of the left one
+    greys: Callable[[], tuple[np.ndarray, np.ndarray]]  # left, right: (H, W) uint8; it waits for them
+    lines: Beside[np.ndarray]  # (N, 4), ``upright_lines`` of the left one
     infinity_px: float  # disparity of a point at infinity
     focal_px: float  # of the left one, along the rows
-    shift_m: np.float32  # of left points into the right camera's frame, along the rows; above 0: mirrored
+    shift_m: np.floating[Any]  # of left points into the right frame, along the rows; above 0: mirrored
     device: torch.device  # of the matches
 
     def shift_px(self, inverse_depth: float) -> float:
@@ -94,54 +96,7 @@ def make_matcher(lowest: int, count: int, channels: int) -> Any:
 
 def pad_columns(image: np.ndarray, count: int) -> np.ndarray:
     """An image with its first column repeated ``count`` times: OpenCV leaves that many columns empty."""
-    pads = ((0, 0), (count, 0), (0, 0))[: image.ndim]
-    return np.ascontiguousarray(np.pad(image, pads, mode="edge"))
-
-
-def _nearest_known(known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns of the nearest known pixels of the row to the left and to the right, ``(H, W)`` each.
-
-    Of a known pixel both are its own; where there is none, -1 and the width.
-    """
-    columns, width = np.arange(known.shape[1])[None], known.shape[1]
-    from_left = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
-    from_right = np.minimum.accumulate(np.where(known, columns, width)[:, ::-1], axis=1)[:, ::-1]
-    return from_left, from_right
-
-
-def hidden_gaps(shift: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """``(H, W)`` bool: gaps between matches that a view to the right cannot see.
-
-    A surface hides a strip of what is behind its left edge, and the strip is as wide as the shift of the near
-    surface exceeds that of the far one. A wider gap, or one without such a step, has another reason.
-
-    Args:
-        shift: ``(H, W)`` pixels; it falls with depth.
-        known: ``(H, W)`` bool, where it is matched.
-    """
-    from_left, from_right = _nearest_known(known)
-    padded = np.pad(np.where(known, shift, np.nan), ((0, 0), (1, 1)), constant_values=np.nan)
-    rows = np.arange(shift.shape[0])[:, None]
-    step = padded[rows, from_right + 1] - padded[rows, from_left + 1]
-    return ~known & (step > LEAST_STEP_PX) & (from_right - from_left - 1 <= step + SLACK_PX)
-
-
-def fill_background(shift: np.ndarray) -> np.ndarray:
-    """Fill holes with the farther of the two neighbours in the row, as KITTI's development kit does.
-
-    ``shift (H, W)`` (pixels or 1/m) falls with depth and is NaN in holes. At a row's ends the only neighbour
-    counts; an empty row copies the nearest filled one above, else below. NaN everywhere if all is unknown.
-    """
-    known = np.isfinite(shift)
-    from_left, from_right = _nearest_known(known)
-    rows = np.arange(shift.shape[0])[:, None]
-    padded = np.pad(np.where(known, shift, np.inf), ((0, 0), (1, 1)), constant_values=np.inf)
-    filled = np.minimum(padded[rows, from_left + 1], padded[rows, from_right + 1])
-    full_rows = np.flatnonzero(known.any(axis=1))
-    if full_rows.size == 0:
-        return np.full_like(shift, np.nan)
-    above = np.searchsorted(full_rows, rows[:, 0], side="right") - 1
-    return filled[full_rows[np.maximum(above, 0)]].astype(shift.dtype)
+    return cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE)
 
 
 def grid_of_rows(size: tuple[int, int]) -> tuple[int, int]:
@@ -161,7 +116,9 @@ def _row_shifts(
     pad = max(0, lowest + count)
     matcher = make_matcher(lowest, count, 1)
     raw = matcher.compute(pad_columns(left, pad), pad_columns(right, pad))[:, pad:]
-    shift = raw.astype(np.float32) / 16.0 - np.float32(infinity_px)
+    shift = raw.astype(np.float32)
+    shift /= 16.0
+    shift -= np.float32(infinity_px)
     return shift, (raw > 16 * (lowest - 1)) & (shift >= MIN_SHIFT_PX)
 
 
@@ -182,30 +139,53 @@ def rectified_pictures(native: PosedViews) -> RowPictures | None:
 
 def row_pictures(left_01: Tensor, view: CameraView, K_left: Tensor) -> RowPictures:
     """A rectified pair of one size, ``left_01 (3, H, W)`` in [0, 1] and ``view`` on either side."""
-    levels = grey(torch.stack([left_01, view.image_01]))[:, 0] * 255.0
-    images = list(levels.round().byte().cpu().numpy())
     K, K_right, T = (each.numpy(force=True) for each in (K_left, view.K, view.T_right_from_left))
-    infinity = float(K[0, 2] - K_right[0, 2])
-    if T[0, 3] > 0:  # mirrored, a view to the left becomes one to the right
-        images, infinity = [image[:, ::-1] for image in images], -infinity
-    left, right = map(np.ascontiguousarray, images)
-    return RowPictures(left, right, upright_lines(left), infinity, float(K[0, 0]), T[0, 3], left_01.device)
+    infinity, mirrored = float(K[0, 2] - K_right[0, 2]), bool(T[0, 3] > 0)
+    levels = grey(torch.stack([left_01, view.image_01]))[:, 0] * 255.0
+    received = sent_to_cpu(levels.round().byte())
+
+    def greys() -> tuple[np.ndarray, np.ndarray]:
+        # Mirrored, a view to the left becomes one to the right.
+        both = (each[:, ::-1] if mirrored else each for each in received().numpy())
+        left, right = map(np.ascontiguousarray, both)
+        return left, right
+
+    lines = Beside(lambda: upright_lines(greys()[0]), left_01.device)
+    infinity = -infinity if mirrored else infinity
+    return RowPictures(greys, lines, infinity, float(K[0, 0]), T[0, 3], left_01.device)
+
+
+def _to_device(layers: Sequence[np.ndarray], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Maps ``(H, W)`` as ``(C, H, W)`` on a device.
+
+    On CUDA the host does not wait for what the device still has to do, as with pageable memory it would.
+    """
+    on_cuda = device.type == "cuda"
+    staged = torch.empty(len(layers), *layers[0].shape, dtype=dtype, device="cpu", pin_memory=on_cuda)
+    np.stack(layers, out=staged.numpy())
+    return staged.to(device, non_blocking=on_cuda)
 
 
 def match_rows(pictures: RowPictures, nearest_px: float) -> RowMatches:
     """Match the rows of a pair; ``nearest_px`` is the largest shift of the search."""
-    shift, known = _row_shifts(pictures.left, pictures.right, pictures.infinity_px, nearest_px)
-    hidden = hidden_gaps(shift, known)
-    between = np.logical_or.accumulate(known, 1) & np.logical_or.accumulate(known[:, ::-1], 1)[:, ::-1]
-    filled = between & ~known & ~hidden
-    shear = certain_shear(pictures.lines, shift, known)
-    order = occlusion_order(pictures.left, shift, known)
-    shift = np.nan_to_num(fill_background(np.where(known, shift, np.float32(np.nan))))
-    maps = np.stack([shift, known, hidden, filled])
-    maps = np.ascontiguousarray(maps[..., ::-1] if pictures.shift_m > 0 else maps)
-    shift_on, matched, hidden_on, filled_on = torch.from_numpy(maps).to(pictures.device)
+    left, right = pictures.greys()
+    shift, known = _row_shifts(left, right, pictures.infinity_px, nearest_px)
+    gaps = find_gaps(known)
+    is_hidden = hidden_gaps(shift, gaps)
+    hidden, filled = (gaps.put(np.zeros_like(known), each) for each in (is_hidden, gaps.inner & ~is_hidden))
+    whole = fill_background(shift, gaps) if known.any() else np.zeros_like(shift)
+    way = slice(None, None, -1 if pictures.shift_m > 0 else 1)  # mirrored pictures are mirrored back
+    (shift_on,) = _to_device([whole[:, way]], torch.float32, pictures.device)
+    kinds = [each[:, way] for each in (known, hidden, filled)]
+    matched, hidden_on, filled_on = _to_device(kinds, torch.bool, pictures.device).float()
     baseline_m = torch.tensor(abs(pictures.shift_m), device="cpu")
-    return RowMatches(shift_on, matched, hidden_on, filled_on, baseline_m, shear, order)
+
+    def checked() -> RowChecks:
+        shear = certain_shear(pictures.lines.result(), shift, known)
+        return RowChecks(shear, occlusion_order(left, shift, gaps))
+
+    checks = Beside(checked, pictures.device)
+    return RowMatches(shift_on, matched, hidden_on, filled_on, baseline_m, checks)
 
 
 def with_hidden(matches: Matches, rows: RowMatches, focal_px: float) -> Matches:

@@ -147,11 +147,11 @@ def indicators_of(
         if not math.isnan(pose.behind_px):  # a product would be another NaN, and verdicts would differ by it
             known["behind_px"] = pose.behind_px * pixels_of_matches(native.size)
         known["mistakes"] = tuple(m for m in pose.warnings if m.forbids_trust and m.code != INVERSE.code)
-    rows = None if evidence.rows is None else evidence.rows.result()
-    if rows is not None:
-        known["occlusion"] = rows.occlusion
-    if rows is not None and not math.isnan(rows.shear):  # a product would be another NaN, as above
-        known["shear"] = rows.shear * native.size[0] / native.size[1]  # pixels are square on its grid
+    of_rows = None if evidence.rows is None else evidence.rows.result().checks.result()
+    if of_rows is not None:
+        known["occlusion"] = of_rows.occlusion
+    if of_rows is not None and not math.isnan(of_rows.shear):  # a product would be another NaN, as above
+        known["shear"] = of_rows.shear * native.size[0] / native.size[1]  # pixels are square on its grid
     if native.views and has_unit:
         known["scale_spread"] = (pose and pose.scale_spread) or math.nan
     half_width = 0.5 * native.size[1]

@@ -6,7 +6,7 @@ import copy
 import functools
 import inspect
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -33,6 +33,7 @@ from geodiff_plugin.runtime.graphs import FasterNetworks
 from geodiff_plugin.runtime.hooks import Exclusive, device_of, layers_of, networks_of
 from geodiff_plugin.runtime.noise_levels import check_scheduler
 from geodiff_plugin.runtime.run import GuidedRun, StepCallback
+from geodiff_plugin.types import MetricDepthOutput
 
 #: What every stock pipeline's call takes, whatever the prior.
 STOCK_ARGUMENTS = (
@@ -100,9 +101,7 @@ class GuidedCall(_Stock):
             plain_torch = without_kernels(not self._uses_kernels)
             with torch.inference_mode(False), torch.no_grad(), plain_torch, noted() as warned:
                 call = _bind(super().__call__, image, *args, **kwargs)
-                run, stock = self._call_guided(call, guidance, callback_on_step_end, held)
-                with torch.autocast(run.device.type, enabled=False):
-                    output = run.output(stock, distinct(guidance.warned, warned))
+                output, stock = self._call_guided(call, guidance, callback_on_step_end, held, warned)
         labelled = zip(image_labels(len(output.verdicts)), output.verdicts, strict=True)
         untrusted = " ".join(label + verdict.sentence for label, verdict in labelled if not verdict.trusted)
         if strict and untrusted:
@@ -113,9 +112,17 @@ class GuidedCall(_Stock):
         return output if call["return_dict"] else (output.prediction, output.uncertainty, output.latent)
 
     def _call_guided(
-        self, call: dict[str, Any], guidance: GeometryGuidance, callback: StepCallback | None, held: Exclusive
-    ) -> tuple[GuidedRun, Any]:
-        """Prepare the run and make the stock call; ``call`` is updated to its final arguments."""
+        self,
+        call: dict[str, Any],
+        guidance: GeometryGuidance,
+        callback: StepCallback | None,
+        held: Exclusive,
+        warned: Sequence[Message],
+    ) -> tuple[MetricDepthOutput, Any]:
+        """The output, and that of the stock call; ``call`` is updated to its final arguments.
+
+        ``warned`` is read last, when everything that warns has been done.
+        """
         lefts = in_stored_pixels(call["image"]) if guidance.as_stored else call["image"]
         lefts_01 = left_images(lefts)  # (N, 3, H, W)
         prior = prior_of(self)
@@ -144,9 +151,10 @@ class GuidedCall(_Stock):
                 call["prompt_depth"] = depth_prompt(evidence.result(), guidance.config)
             run = GuidedRun(codec, guidance, evidence.result, call, rounds, unlocked)
             stock = self._run_stock(run, call)
+            with torch.autocast(device.type, enabled=False):
+                return run.output(stock, distinct(guidance.warned, warned)), stock
         finally:
             evidence.close()
-        return run, stock
 
     def _run_stock(self, run: GuidedRun, call: dict[str, Any]) -> Any:
         """The stock call within a run."""

@@ -27,13 +27,14 @@ from geodiff_plugin.algorithm.state import chunk_views
 from geodiff_plugin.algorithm.terms import Given, Objective, match_exposure, photometric, ssim
 from geodiff_plugin.config import DEFAULT, MARIGOLD_DC, PAPER, UpdatePlan
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.evidence.prepare import pictures_beside, prepare_evidence, rows_beside
+from geodiff_plugin.evidence.prepare import prepare_evidence, rows_beside
 from geodiff_plugin.formats.images import intrinsics_from_exif
 from geodiff_plugin.geometry import hidden_in_right, is_rectified, project, resize_image, warp_right_to_left
 from geodiff_plugin.matching import build_cost_volume, known_share, points_to_matches, with_points
 from geodiff_plugin.matching.build import inverse_pose_preferred
 from geodiff_plugin.matching.consistency import match_volume
 from geodiff_plugin.matching.matches import Matches, reject_reflections
+from geodiff_plugin.matching.rows import rectified_pictures
 from geodiff_plugin.pose.estimate import find_scale
 from geodiff_plugin.pose.refine import Displacement, fit_displacement, refined_scale, straightened
 from geodiff_plugin.pose.tracks import Tracks, project_tracks, solve_inverse_depth
@@ -398,7 +399,7 @@ def finished() -> dict[str, object]:
     for e in (0.03, 0.12):
         error = torch.full((1, 1, 1, 1), e)
         native = PosedViews(left, (*views, rectified), K)
-        rows = rows_beside(pictures_beside(native), target, None)
+        rows = rows_beside(rectified_pictures(native), target, None)
         evidence = Evidence(native, native, None, target, rows=rows)
         voted_m = vote_depth(depth_m, evidence, target, known_share(target), error)
         result[f"voted_{e}"] = (voted_m / depth_m).log()

@@ -18,7 +18,7 @@ ROW = re.compile(r"^\| `([\w.]+)` \| ((?:`[\w.]+`(?:, )?)+) \|", re.M)
 NAMES = {"K", "K_left", "K_right", "T_right_from_left", "right", "rights", "views"}
 RECORDS = {"GeometryGuidance", "Inputs", "CameraView", "PosedViews", "Evidence", "ImageResult"}
 #: What is used all along the way.
-HELPERS = {"_camera_checks", "geometry", "types"}
+HELPERS = {"_camera_checks", "_threads", "geometry", "types"}
 
 
 def holds_a_view(name: str, value: object) -> bool:

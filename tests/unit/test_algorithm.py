@@ -19,10 +19,10 @@ from geodiff_plugin.algorithm.solver import FieldSystem, RobustField, solve_fiel
 from geodiff_plugin.algorithm.terms import Given, Loss
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.evidence.prepare import pictures_beside, rows_beside
+from geodiff_plugin.evidence.prepare import rows_beside
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import Matches, known_share, rows
-from geodiff_plugin.matching.rows import hidden_gaps, match_rows, row_pictures, with_hidden
+from geodiff_plugin.matching.rows import match_rows, rectified_pictures, row_pictures, with_hidden
 from geodiff_plugin.result import voting
 from geodiff_plugin.result.misfit import MATCH_NOISE_PX, expected_error
 from geodiff_plugin.result.voting import vote_depth
@@ -346,7 +346,9 @@ def scene(side: int = 1, doffs: float = 0.0) -> tuple[Tensor, Tensor, CameraView
 def voted(map_m: Tensor, left: Tensor, views, matched_m: Tensor, confidence: float, error=0.4, *spacing):
     target = Matches(1.0 / matched_m, torch.full_like(matched_m, confidence), torch.full((1,), 2e-3))
     native = PosedViews(left[0], tuple(views), CAMERA)
-    evidence = Evidence(native, native, None, target, rows=rows_beside(pictures_beside(native), target, None))
+    evidence = Evidence(
+        native, native, None, target, rows=rows_beside(rectified_pictures(native), target, None)
+    )
     return vote_depth(map_m, evidence, target, known_share(target), torch.full((1, 1, 1, 1), error), *spacing)
 
 
@@ -358,17 +360,6 @@ def test_rows_are_matched_whatever_side_and_principal_point_the_view_has(side, d
     right = (found.shift - 18.0 / truth[0, 0]).abs()[seen] < 0.5
     assert seen.float().mean() > 0.6 and right.float().mean() > 0.9
     assert gaps.any() and not (gaps & seen).any()
-
-
-def test_a_gap_is_hidden_where_it_is_no_wider_than_the_step_beside_it():
-    """Gaps of 6 pixels: far before near, near before far, without a step, and with too small a step."""
-    ends = [(4.0, 10.0), (10.0, 4.0), (4.0, 4.0), (4.0, 7.0)]
-    shift = np.array([[far] * 5 + [0.0] * 6 + [near] * 5 for far, near in ends], np.float32)
-    known = shift > 0
-    found = hidden_gaps(shift, known)
-    assert found[0].tolist() == (~known[0]).tolist()
-    assert not found[1:].any()
-    assert not hidden_gaps(shift[:, 5:], known[:, 5:]).any()  # the gap has no farther end
 
 
 @pytest.mark.parametrize("side", [1, -1])

@@ -13,9 +13,10 @@ import torch
 
 from geodiff_plugin import GeometryGuidance, _kernels, _threads
 from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin._threads import Beside, tensors_of
+from geodiff_plugin._threads import Beside, sent_to_cpu, tensors_of
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.matching import rows
 
 
 def _reachable(evidence: Evidence) -> dict[int, torch.Tensor]:
@@ -69,7 +70,10 @@ class Stream:
 
     def record_event(self) -> SimpleNamespace:
         self.said.append((self.name, "records an event"))
-        return SimpleNamespace(wait=lambda: self.said.append((now.stream.name, "waits for the event")))
+        return SimpleNamespace(
+            wait=lambda: self.said.append((now.stream.name, "waits for the event")),
+            synchronize=lambda: self.said.append((self.name, "is waited for")),
+        )
 
     def wait_stream(self, other: Stream) -> None:
         self.said.append((self.name, f"waits for {other.name}"))
@@ -152,3 +156,48 @@ def test_closing_waits_for_the_work_and_what_it_raised_is_for_whoever_asks(card)
     assert ended == [1]
     with pytest.raises(ZeroDivisionError):
         answer.result()
+
+
+def test_closing_waits_for_the_threads_that_an_answer_holds(card):
+    ended = []
+
+    def work() -> None:
+        time.sleep(0.05)
+        ended.append(1)
+
+    answer = Beside(lambda: {"still": [Beside(work, card.device)]}, card.device)
+    answer.close()
+    assert ended == [1]
+
+
+def test_what_a_device_is_asked_for_is_waited_for_where_it_is_needed(card):
+    received = sent_to_cpu(torch.arange(3).as_subclass(OnCard))
+    assert card.said == [("caller", "records an event")]
+    assert received().tolist() == [0, 1, 2] and card.said[1:] == [("caller", "is waited for")]
+    here = torch.arange(3)
+    assert sent_to_cpu(here)() is here
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_no_work_outlives_a_guided_call_that_ends_early(pipe, textured_plane, monkeypatch, error):
+    """As on CUDA, where the rows are matched beside the network, and nobody asks for them then."""
+    monkeypatch.setattr(_threads, "leaves_cpu_free", lambda device: True)
+    begun, ended, pair = threading.Event(), [], textured_plane
+
+    def slowly(*args):
+        begun.set()
+        time.sleep(0.3)
+        ended.append(1)
+        return certain_shear(*args)
+
+    certain_shear = rows.certain_shear
+    monkeypatch.setattr(rows, "certain_shear", slowly)
+
+    def stops(*_):
+        assert begun.wait(30)
+        raise error
+
+    pipe.unet.register_forward_hook(stops)
+    with pytest.raises(error):
+        pipe(pair.left, guidance=GeometryGuidance(pair.right, pair.K, pair.E), num_inference_steps=2)
+    assert ended == [1]

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin._threads import Beside
 from geodiff_plugin.algorithm.state import chunk_views
 from geodiff_plugin.algorithm.terms import Given, Objective
 from geodiff_plugin.config import KNOBS, GuidanceConfig
@@ -194,7 +193,7 @@ def test_rows_are_sought_up_to_the_nearest_of_matches_and_known_points(monkeypat
         else Matches(torch.tensor([[[[0.1, most]]]]), torch.ones(1, 1, 1, 2), torch.ones(1))
         for most in (of_match, of_point)
     )
-    pictures = SimpleNamespace(shift_px=lambda inverse_depth: 7.0 * inverse_depth)
     here = torch.device("cpu")
-    assert rows_beside(Beside(lambda: pictures, here), matches, points).result() == 14.0
-    assert rows_beside(Beside(lambda: None, here), matches, points).result() is None
+    pictures = SimpleNamespace(shift_px=lambda inverse_depth: 7.0 * inverse_depth, device=here)
+    assert rows_beside(pictures, matches, points).result() == 14.0
+    assert rows_beside(None, matches, points) is None

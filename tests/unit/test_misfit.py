@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from geodiff_plugin._threads import Beside
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.matching.rows import RowMatches
+from geodiff_plugin.matching.rows import RowChecks, RowMatches
 from geodiff_plugin.result.indicators import indicators_of
 from geodiff_plugin.result.misfit import NO_MISFIT, Misfit, expected_error, misfit_of, share_left
 from geodiff_plugin.types import CameraView, Indicators, PosedViews, PoseReport
@@ -140,7 +140,8 @@ def test_the_indicators_of_a_run_hold_the_worst_view_in_pixels_of_the_left_image
     found = indicators_of(Evidence(native, native, None, None, pose=pose), {})
     assert (found.straightened_px, found.behind_px, found.depth_spread) == (1.5, 4.0, 0.2)
     assert (found.exchangeable, found.moved, found.bars) == (0.3, 0.2, 0.1)
-    matched = RowMatches(left, left, left, left, torch.tensor(0.1), shear=0.01, occlusion=-0.5)
-    rows = Beside(lambda: matched, torch.device("cpu"))
+    checks = Beside(lambda: RowChecks(shear=0.01, occlusion=-0.5), left.device)
+    matched = RowMatches(left, left, left, left, torch.tensor(0.1), checks)
+    rows = Beside(lambda: matched, left.device)
     found = indicators_of(Evidence(native, native, None, None, rows=rows), {})
     assert (found.occlusion, found.shear) == (-0.5, pytest.approx(0.01 * 20 / 1664))

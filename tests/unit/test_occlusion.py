@@ -4,7 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from geodiff_plugin.matching.occlusion import FEWEST, REACH_PX, occlusion_order
+from geodiff_plugin.matching import occlusion
+from geodiff_plugin.matching.gaps import find_gaps
+from geodiff_plugin.matching.occlusion import FEWEST, REACH_PX
 
 HEIGHT, WIDTH, RISE = 80, 200, 12
 #: Columns of a box that stands before a wall.
@@ -20,6 +22,10 @@ def box_before_a_wall(rows: int = HEIGHT) -> tuple[np.ndarray, np.ndarray, np.nd
     grey[:rows, BOX], shift[:rows, BOX] = rng.integers(190, 210, (rows, 50)), 5.0 + RISE
     matched[:rows, BOX.start - RISE : BOX.start] = False  # of the wall, hidden from the camera to the right
     return grey, shift, matched
+
+
+def occlusion_order(grey: np.ndarray, shift: np.ndarray, matched: np.ndarray) -> float:
+    return occlusion.occlusion_order(grey, shift, find_gaps(matched))
 
 
 def test_near_hides_far_and_a_mirrored_pair_shows_the_opposite():

@@ -101,5 +101,5 @@ def test_matched_rows_of_a_sheared_picture_say_so(way):
         left_01, right_01 = (
             torch.from_numpy(each / 255.0).float().expand(3, -1, -1) for each in (grey, right)
         )
-        found = match_rows(row_pictures(left_01, CameraView(right_01, K, T), K), 60.0).shear
+        found = match_rows(row_pictures(left_01, CameraView(right_01, K, T), K), 60.0).checks.result().shear
         assert found == pytest.approx(shear, abs=0.01)

@@ -29,7 +29,8 @@ from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.formats import as_image_01, read_depth_png
 from geodiff_plugin.formats.depth import read_map
 from geodiff_plugin.matching import CostVolume, build_cost_volume, match_volume
-from geodiff_plugin.matching.rows import PARAMETERS, fill_background, make_matcher, pad_columns
+from geodiff_plugin.matching.gaps import fill_background
+from geodiff_plugin.matching.rows import PARAMETERS, make_matcher, pad_columns
 from geodiff_plugin.types import CameraView, PosedViews
 
 
