@@ -98,20 +98,22 @@ def ticks(near: float, far: float, most: int = 8) -> list[float]:
 
 @functools.cache
 def _table(colours: str) -> np.ndarray:
-    """``(SHADES, 3)`` uint8 of a colour map."""
+    """``(SHADES + 1, 3)`` uint8 of a colour map, and last the grey of what is unknown."""
     import matplotlib
 
-    return matplotlib.colormaps[colours].resampled(SHADES)(np.arange(SHADES), bytes=True)[:, :3]
+    shades = matplotlib.colormaps[colours].resampled(SHADES)(np.arange(SHADES), bytes=True)[:, :3]
+    return np.vstack([shades, np.full((1, 3), GREY, np.uint8)])
 
 
 def _coloured(
     values: np.ndarray, use: np.ndarray, share_of: Callable[[Any], Any], colours: str
 ) -> np.ndarray:
     """``(H, W, 3)`` uint8 of a map; ``share_of`` tells each value's place among the colours."""
-    picture = np.full((*values.shape, 3), GREY, np.uint8)
+    picture = np.empty((*values.shape, 3), np.uint8)
     for rows in row_strips(*values.shape):
-        shares = np.clip(share_of(values[rows][use[rows]].astype(np.float64)), 0.0, 1.0)
-        picture[rows][use[rows]] = _table(colours)[np.minimum(shares * SHADES, SHADES - 1).astype(np.intp)]
+        known = np.where(use[rows], values[rows], 1.0).astype(np.float64)
+        shades = np.clip(share_of(known) * SHADES, 0, SHADES - 1).astype(np.intp)
+        picture[rows] = np.take(_table(colours), np.where(use[rows], shades, SHADES), axis=0)
     return picture
 
 
@@ -191,11 +193,13 @@ def _drawn(legend: _Legend) -> np.ndarray:
     return np.asarray(rasterised(figure))
 
 
-def _figure(picture: np.ndarray, colours: str, label: str, marks: Sequence[tuple[float, str]]) -> Image.Image:
-    """A picture beside its colour bar with texts at shares of it; a grey key where pixels are unknown."""
-    unknown = bool((picture == GREY).all(axis=-1).any())  # no colour is grey
+def _figure(
+    picture: np.ndarray, colours: str, label: str, marks: Sequence[tuple[float, str]], unknown: bool
+) -> Image.Image:
+    """A picture beside its colour bar with texts at shares of it; a grey key where pixels are ``unknown``."""
     factor = math.ceil(FIGURE_MIN_HEIGHT / len(picture))  # a whole one, so that pixels stay squares
-    picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
+    if factor > 1:
+        picture = picture.repeat(factor, axis=0).repeat(factor, axis=1)
     legend = _Legend(len(picture), max(12, len(picture) // 26), colours, label, tuple(marks), unknown)
     return Image.fromarray(np.hstack([picture, _drawn(legend)]))
 
@@ -207,13 +211,15 @@ def depth_figure(
     near, far = depth_range(depth_m, near, far)
     marks = [(math.log(z / near) / math.log(far / near), f"{z:g}") for z in ticks(near, far)]
     label = "no unit" if unit is None else f"depth, {unit}"
-    return _figure(colour_depth(depth_m, near, far), f"{DEPTH_COLOURS}_r", label, marks)
+    unknown = not _known(_as_map(depth_m)).all()
+    return _figure(colour_depth(depth_m, near, far), f"{DEPTH_COLOURS}_r", label, marks, unknown)
 
 
 def share_figure(values: np.ndarray, label: str, top: float) -> Image.Image:
     """A map ``(H, W)`` of something from 0 to ``top`` (> 0), beside a colour bar under its ``label``."""
     marks = [(share, f"{share * top:.2g}") for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
-    return _figure(colour_share(values, top), SHARE_COLOURS, label, marks)
+    unknown = not np.isfinite(values).all()
+    return _figure(colour_share(values, top), SHARE_COLOURS, label, marks, unknown)
 
 
 def as_picture(image: Any) -> Image.Image:
@@ -222,7 +228,7 @@ def as_picture(image: Any) -> Image.Image:
         return image.convert("RGB")
     values = np.asarray(image)
     if values.dtype.kind in "fb":
-        values = in_8_bits(np.nan_to_num(values.astype(np.float32)))
+        values = in_8_bits(np.nan_to_num(values.astype(np.float32, copy=False)))
     if values.dtype != np.uint8 or not (values.ndim == 2 or (values.ndim == 3 and values.shape[-1] == 3)):
         expected = "PIL, or (H, W) or (H, W, 3) of uint8, bool or [0, 1]"
         bad_value("images", expected, f"{values.dtype} {values.shape}")
@@ -265,18 +271,26 @@ def grid(
     return sheet
 
 
+def shrunk(figure: Image.Image) -> Image.Image:
+    """A figure as wide as an overview shows it."""
+    size = CELL_WIDTH, max(1, round(figure.height * CELL_WIDTH / figure.width))
+    return figure.resize(size, reducing_gap=2.0)
+
+
 def overview(
-    left_01: Map, depth_m: Map, confidence: Map | None, error: Map | None, unit: str | None = "m"
+    left_01: Map, depth: Image.Image, confidence: Image.Image | None, error: Map | None
 ) -> Image.Image:
-    """Left image in [0, 1], depth, any confidence and photometric error (not finite if unseen), 2 a row."""
-    every = max(1, depth_m.shape[1] // (2 * CELL_WIDTH))
-    depth = depth_figure(depth_m[::every, ::every], unit=unit)
-    left = as_picture(left_01[::every, ::every].astype(np.float32))
+    """Left image in [0, 1], depth, any confidence and photometric error (not finite if unseen), 2 a row.
+
+    ``depth`` and ``confidence`` are ``shrunk`` figures.
+    """
+    every = max(1, left_01.shape[1] // (2 * CELL_WIDTH))
+    left = as_picture(left_01[::every, ::every])
     beside = Image.new("RGB", depth.size, "white")  # as wide as a map with its bar: all have one scale
     beside.paste(left.resize((round(left.width * depth.height / left.height), depth.height)), (0, 0))
     cells = {"left image": beside, "depth": depth}
     if confidence is not None:
-        cells["confidence"] = share_figure(confidence[::every, ::every], "within 10 %", 1.0)
+        cells["confidence: within 10 % of the truth"] = confidence
     if error is not None:
         error = error[::every, ::every]
         finite = error[np.isfinite(error)]

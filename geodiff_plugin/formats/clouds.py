@@ -94,22 +94,27 @@ def make_cloud(
 def _cloud_strips(
     depth_m: np.ndarray, image_01: np.ndarray, K: np.ndarray, valid: np.ndarray | None
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Points and colours of ``make_cloud``, a strip of rows after the other."""
+    """Points and colours of ``make_cloud``, a strip of rows after the other; coordinates are contiguous."""
     depth_m, image_01 = np.asarray(depth_m), np.asarray(image_01)
     if depth_m.ndim != 2 or image_01.shape != (*depth_m.shape, 3):
         bad_value("image_01", "(H, W, 3) over a depth of (H, W)", f"{image_01.shape} over {depth_m.shape}")
-    unproject = np.linalg.inv(check_intrinsics(K)).T
+    unproject, u = np.linalg.inv(check_intrinsics(K)), np.arange(depth_m.shape[1])
     for rows in row_strips(*depth_m.shape):
-        z = depth_m[rows].astype(np.float64)
-        use = _usable(z, None if valid is None else valid[rows])
-        v, u = np.nonzero(use)
-        points = np.stack([u, v + rows.start, np.ones_like(u)], axis=-1) @ unproject * z[use][:, None]
-        yield points, in_8_bits(image_01[rows][use])
+        z, v = depth_m[rows].astype(np.float64), np.arange(rows.start, rows.stop)[:, None]
+        used = np.flatnonzero(_usable(z, None if valid is None else valid[rows]))
+        points = [((u * of_u + v * of_v + of_both) * z).ravel()[used] for of_u, of_v, of_both in unproject]
+        colours = np.take(in_8_bits(image_01[rows]).reshape(-1, 3), used, axis=0)  # quicker than an index
+        yield np.stack(points).T, colours
 
 
 def in_8_bits(image: np.ndarray) -> np.ndarray:
     """Colours in 8 bits, of uint8 or of floats in [0, 1]."""
-    return image if image.dtype == np.uint8 else np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+    if image.dtype == np.uint8:
+        return image
+    levels = np.empty(image.shape, np.uint8)
+    for rows in row_strips(len(image), math.prod(image.shape[1:])):
+        levels[rows] = np.rint(np.clip(image[rows], 0.0, 1.0) * 255.0)
+    return levels
 
 
 def make_mesh(
@@ -187,8 +192,10 @@ def write_vertices(
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join([*lines, "end_header\n"]).encode("ascii"))
         for part in parts:
-            columns = [column for array in part for column in array.T]
-            file.write(np.rec.fromarrays(columns, dtype=vertex).tobytes())
+            vertices = np.empty(len(part[0]), vertex)
+            for name, column in zip(names, (column for array in part for column in array.T), strict=True):
+                vertices[name] = column
+            file.write(vertices.tobytes())
 
 
 def camera_pyramid(K: np.ndarray, E: np.ndarray, size: tuple[int, int], length_m: float) -> np.ndarray:

@@ -11,6 +11,7 @@ from PIL import Image
 from geodiff_plugin import formats, plotting
 from geodiff_plugin._reprojection import PosedCamera, depth_in_camera
 from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.formats.clouds import in_8_bits
 from geodiff_plugin.formats.files import save_png
 from geodiff_plugin.formats.out import REPORT, HeldPlace, OutFolder
 from geodiff_plugin.formats.target import read_target_camera
@@ -69,22 +70,24 @@ def write_maps(
     formats.write_depth_npy(folder / "depth.npy", depth_m)
     valid = single_map(output.valid)
     zeros = formats.write_depth_mm(folder / "depth_mm.png", depth_m * valid)
-    save_png(plotting.depth_figure(depth_m, unit=output.unit), folder / "depth.png")
+    depth = _save_figure(plotting.depth_figure(depth_m, unit=output.unit), folder / "depth.png")
     maps = {name: np.asarray(extra)[0] for name, extra in output.extras.items()}
     of_call = {name: getattr(output, name) for name in ("photometric_error", "uncertainty", "confidence")}
     maps |= {name: single_map(value) for name, value in of_call.items() if value is not None}
     for name, values in maps.items():
         np.save(folder / f"{name}.npy", values.astype(np.float32))
-    flying, doubtful, error = formats.flying_points(depth_m), np.zeros(depth_m.shape, dtype=bool), None
+    flying, doubtful = formats.flying_points(depth_m), np.zeros(depth_m.shape, dtype=bool)
+    confidence = error = None
     if output.visible is not None:
         visible = single_map(output.visible).astype(bool)
         save_png(Image.fromarray(visible.astype(np.uint8) * 255), folder / "visible.png")
         error = np.where(visible, maps["photometric_error"], np.nan)
     if output.confidence is not None:
-        save_png(plotting.share_figure(maps["confidence"], "confidence", 1.0), folder / "confidence.png")
+        figure = plotting.share_figure(maps["confidence"], "confidence", 1.0)
+        confidence = _save_figure(figure, folder / "confidence.png")
         doubtful = maps["confidence"] < min_confidence
-    overview = plotting.overview(left, depth_m, maps.get("confidence"), error, output.unit)
-    save_png(overview, folder / "overview.png")
+    left = in_8_bits(left)
+    save_png(plotting.overview(left, depth, confidence, error), folder / "overview.png")
     kept = valid & ~(flying | doubtful)
     points = formats.write_ply(folder / "cloud.ply", depth_m, left, K, valid=kept, unit=output.unit)
     return {
@@ -94,6 +97,12 @@ def write_maps(
         "doubtful_points": int(doubtful.sum()),
         "points_out_of_reach": int((~valid).sum()),
     }
+
+
+def _save_figure(figure: Image.Image, path: Path) -> Image.Image:
+    """Save a figure; what the overview shows of it, as it may be large."""
+    save_png(figure, path)
+    return plotting.shrunk(figure)
 
 
 def write_into(folder: Path, depth_m: np.ndarray, K: np.ndarray, path: Path) -> dict[str, Any]:
