@@ -13,7 +13,7 @@ import torch
 
 from geodiff_plugin._checks import InputError, refuse
 from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin._threads import Beside, WithinCores, leaves_cpu_free
+from geodiff_plugin._threads import Beside, WithinCores, available_cores, leaves_cpu_free
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.formats import recordings
@@ -28,8 +28,8 @@ from geodiff_plugin.jobs.pairs import COLUMNS, SUMMARY, PairRef, options_of
 from geodiff_plugin.jobs.prior import graphs_for_many, prior_of_options
 from geodiff_plugin.jobs.reading import PairInputs, read_pair
 from geodiff_plugin.jobs.records import JobLog, PairRun
-from geodiff_plugin.jobs.runner import Runner
-from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcess
+from geodiff_plugin.jobs.runner import Runner, SideBySide, Stage
+from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcesses
 from geodiff_plugin.jobs.steady import write_steady_frames
 from geodiff_plugin.jobs.tables import write_table
 from geodiff_plugin.jobs.telling import Tell, silent
@@ -39,6 +39,10 @@ from geodiff_plugin.runtime.machine import pick_device
 
 #: What became of every pair.
 JOURNAL = ".pairs.jsonl"
+#: Processes that write, at most: they keep up with a GPU, and each has Python, torch and a pair in memory.
+MOST_WRITERS = 3
+#: Cores that they leave to the threads that read, make evidence and guide.
+CORES_OF_STAGES = 3
 
 
 class _EndsRun(BaseException):
@@ -98,8 +102,9 @@ class Stages:
     """The stages of a pair, each called in a thread of its own.
 
     A ``pipe`` that is not given is loaded when the first pair has been read; ``among`` stages compute at the
-    same time and share the cores; ``tell`` hears which prior it is, and what was assumed. Beside a GPU a
-    process of its own writes: its thread would keep the others, which launch kernels, from Python's lock.
+    same time and share the cores; ``tell`` hears which prior it is, and what was assumed. Beside a GPU
+    processes of their own write ``pairs`` pairs, started at once, as the prior takes longer to load than they
+    to start: a thread that writes would keep the others, which launch kernels, from Python's lock.
     """
 
     def __init__(
@@ -110,17 +115,26 @@ class Stages:
         *,
         among: int = 2,
         tell: Tell = silent,
+        pairs: int = MOST_WRITERS,
     ) -> None:
         self._options, self._device, self._pipe = options, device, pipe
         self._among, self._tell = among, tell
         self._views, self._folders = Views(options), dict[str, ExitStack]()
-        self._writer = SeparateProcess(write_row.__module__) if leaves_cpu_free(device) else None
+        count = _writers(device, pairs)
+        self._writers = SeparateProcesses(write_row.__module__, count) if count else None
+        #: The stages in their order.
+        self.all: tuple[Stage, ...] = (
+            self.read,
+            self.evidence,
+            self.guide,
+            SideBySide(self.write, max(1, count)),
+        )
 
     def close(self) -> None:
-        """Close the videos and end the process that writes, when the threads are done."""
+        """Close the videos and end the processes that write, when the threads are done."""
         self._views.close()
-        if self._writer is not None:
-            self._writer.close()
+        if self._writers is not None:
+            self._writers.close()
 
     def read(self, item: Item) -> _OnItsWay:
         """Look at the files, take the folder, decode the views."""
@@ -168,13 +182,20 @@ class Stages:
         """The files, the report last, and the row of the table."""
         assert pair.run is not None
         with _ends_run_if_all_would_fail():
-            if self._writer is None:
+            if self._writers is None:
                 return write_row(pair.folder, pair.run, pair.entries)
-            return self._writer.call(write_row, pair.folder.place, pair.run, pair.entries)
+            return self._writers.call(write_row, pair.folder.place, pair.run, pair.entries)
 
     def release(self, item: Item) -> None:
         """Give back the folder of a pair."""
         self._folders.pop(item.key, ExitStack()).close()
+
+
+def _writers(device: torch.device, pairs: int) -> int:
+    """How many processes write so many pairs; none where the device leaves them no core."""
+    if not leaves_cpu_free(device):
+        return 0
+    return min(pairs, MOST_WRITERS, max(1, available_cores() - CORES_OF_STAGES))
 
 
 def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
@@ -229,7 +250,8 @@ def depth_pairs(
                 records = pairs_to_folders(options, items, journal, progress=progress)
             else:
                 runner = Runner(items, journal, noun="pair", survives=(Exception,), progress=progress)
-                records = _through(Stages(options, device, pipe, tell=tell), runner)
+                left = sum(journal.get(item) is None for item in items)
+                records = _through(Stages(options, device, pipe, tell=tell, pairs=left), runner)
         rows = [_final(record, there.get(record["key"]), options, tell) for record in records]
         write_table(shard.path(options.out / SUMMARY), rows, tell)
         if options.steady:
@@ -258,8 +280,7 @@ def _through(stages: Stages, runner: Runner) -> list[Row]:
     """The records of all pairs, once they are through the stages."""
     try:
         with _ends_run_if_all_would_fail():
-            steps = (stages.read, stages.evidence, stages.guide, stages.write)
-            return runner.run(*steps, release=stages.release)
+            return runner.run(*stages.all, release=stages.release)
     except _EndsRun as ended:
         assert ended.__cause__ is not None
         raise ended.__cause__ from None

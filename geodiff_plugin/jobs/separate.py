@@ -16,6 +16,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from io import BufferedReader
+from queue import LifoQueue
 from typing import Any, TypeVar
 
 from geodiff_plugin._checks import InputError, noted, warn
@@ -71,7 +72,7 @@ class SeparateProcess:
             self._process.stdin.flush()
             told: _Told = pickle.load(self._process.stdout)
         except (OSError, EOFError, pickle.UnpicklingError) as error:
-            ended = f"The process that writes results has ended (exit code {self._process.wait()})."
+            ended = f"A process that writes results has ended (exit code {self._process.wait()})."
             cure = "Is there enough memory? Finished results stay; the same command goes on with the rest."
             raise ProcessEnded(f"{ended} {cure}") from error
         for message in told.warned:
@@ -80,13 +81,45 @@ class SeparateProcess:
             raise told.error
         return told.answer
 
-    def close(self) -> None:
-        """Wait until it has ended what it is at."""
+    def leave(self) -> None:
+        """Let it end once it has done what it is at."""
         for stream in (self._process.stdin, self._process.stdout):
             with suppress(OSError):  # it ended before
                 assert stream is not None
                 stream.close()
+
+    def close(self) -> None:
+        """Let it end, and wait until it has."""
+        self.leave()
         self._process.wait()
+
+
+class SeparateProcesses:
+    """As many calls at a time as there are processes, each made in a thread of the caller's.
+
+    Arguments as of ``SeparateProcess``.
+    """
+
+    def __init__(self, module: str, count: int) -> None:
+        self._all = [SeparateProcess(module) for _ in range(count)]
+        self._free = LifoQueue[SeparateProcess]()  # the last one has what it needs in its caches
+        for process in self._all:
+            self._free.put(process)
+
+    def call(self, function: Callable[..., Answer], *args: Any) -> Answer:
+        """``SeparateProcess.call`` of one that does nothing else, once there is one."""
+        process = self._free.get()
+        try:
+            return process.call(function, *args)
+        finally:
+            self._free.put(process)
+
+    def close(self) -> None:
+        """Let all end, and wait until they have."""
+        for process in self._all:
+            process.leave()
+        for process in self._all:
+            process.close()
 
 
 def serve() -> None:

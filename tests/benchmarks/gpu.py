@@ -331,7 +331,7 @@ def folder(bench: Bench) -> Iterator[Row]:
     """Pairs a second of ``geodiff depth`` on a folder, graphs included, and of stock calls on its lefts."""
     from geodiff_plugin.jobs.options import DepthOptions  # and what the commands need, in this part alone
     from geodiff_plugin.jobs.prior import graphs_for_many
-    from tests.benchmarks.many import MOST_ON_THE_WAY, ManyPairs
+    from tests.benchmarks.many import ManyPairs
 
     where, size = bench.folder / "pairs", bench.scope.size
     for side in ("left", "right"):
@@ -359,7 +359,7 @@ def folder(bench: Bench) -> Iterator[Row]:
     )
     enable_geometry_guidance(bench.pipe, graphs=graphs_for_many(options, bench.device))
     with closing(ManyPairs(options, bench.pipe)) as many:
-        guided = functools.partial(many.seconds, MOST_ON_THE_WAY, True)
+        guided = functools.partial(many.seconds, None, True)
         calls = {"plain, files read and written": plain, "guided, the command": guided}
         rounds = 3  # graphs are recorded at the second call of a size
         taken = {name: min(timed(call, bench.device) for _ in range(rounds)) for name, call in calls.items()}

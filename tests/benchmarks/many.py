@@ -33,12 +33,12 @@ from tests.scenes import render_pair
 
 __all__ = ["WAYS", "ManyPairs", "main"]
 
-MOST_ON_THE_WAY = 4
-#: Name -> pairs that may be on the way at a time, and whether matching and guiding share the cores.
+#: Name -> pairs that may be on the way at a time (as many as the command has), and whether matching and
+#: guiding share the cores.
 WAYS = {
     "one after the other": (1, False),
-    "overlapped, all threads each": (MOST_ON_THE_WAY, False),
-    "overlapped": (MOST_ON_THE_WAY, True),
+    "overlapped, all threads each": (None, False),
+    "overlapped": (None, True),
 }
 KIND, BASELINE_M = "street", 0.54
 
@@ -85,18 +85,18 @@ class ManyPairs:
         self._options, self._refs = options, start_many(options)
         self._device = pick_device(options.device)
         self._pipe = load_guided_prior(options.prior, self._device) if pipe is None else pipe
-        self._stages = dict[int, Stages]()  # kept: beside a GPU each starts a process
+        self._stages = dict[int, Stages]()  # kept: beside a GPU each starts processes
 
     def close(self) -> None:
         """End what the stages have opened and started."""
         for stages in self._stages.values():
             stages.close()
 
-    def seconds(self, most: int, shared: bool) -> tuple[float, float]:
+    def seconds(self, most: int | None, shared: bool) -> tuple[float, float]:
         """Seconds of a clock and of all cores for all pairs.
 
         Args:
-            most: pairs that may be on the way at a time.
+            most: pairs that may be on the way at a time; ``None`` for as many as the command has.
             shared: matching and guiding share the cores, as in the command.
 
         Raises:
@@ -106,13 +106,12 @@ class ManyPairs:
         if among not in self._stages:
             self._stages[among] = Stages(self._options, self._device, self._pipe, among=among)
         stages = self._stages[among]
-        steps = [stages.read, stages.evidence, stages.guide, stages.write]
         with tempfile.TemporaryDirectory() as folder:
             items = [Item(ref.name, ref) for ref in self._refs]
             with Journal(Path(folder) / "pairs.jsonl") as journal:
                 runner = Runner(items, journal, progress=False)
                 clock, cores = time.perf_counter(), time.process_time()
-                runner.run(*steps, release=stages.release, most=most)
+                runner.run(*stages.all, release=stages.release, most=most)
                 return time.perf_counter() - clock, time.process_time() - cores
 
 
