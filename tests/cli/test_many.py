@@ -5,6 +5,9 @@ import errno
 import json
 import os
 import shutil
+import signal
+import sys
+import threading
 from pathlib import Path
 
 import cv2
@@ -118,16 +121,26 @@ def test_two_folders_give_what_single_runs_give(geodiff, finished):
     assert sorted(os.listdir("out/b")) == sorted(os.listdir("one"))
 
 
-def test_beside_a_gpu_another_process_writes_the_same_files(geodiff, fresh, made, monkeypatch):
-    calls = []
+@pytest.fixture
+def beside_gpu(monkeypatch):
+    """As on a GPU, two processes write; takes what is called with every pair's place before it is written."""
 
-    class Spied(many.SeparateProcess):
-        def call(self, function, *args):
-            calls.append(function.__name__)
-            return super().call(function, *args)
+    def let(before):
+        class Watched(many.SeparateProcesses):
+            def call(self, function, *args):
+                before(super().call, function, args[0])
+                return super().call(function, *args)
 
-    monkeypatch.setattr(many, "SeparateProcess", Spied)
+        monkeypatch.setattr(many, "SeparateProcesses", Watched)
+
     monkeypatch.setattr(many, "leaves_cpu_free", lambda device: True)
+    monkeypatch.setattr(many, "available_cores", lambda: many.CORES_OF_STAGES + 2)
+    return let
+
+
+def test_beside_a_gpu_other_processes_write_the_same_files(geodiff, fresh, made, beside_gpu):
+    calls = []
+    beside_gpu(lambda call, function, place: calls.append(function.__name__))
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     assert geodiff(*COMMAND, "-q").code == 0
@@ -141,6 +154,55 @@ def test_beside_a_gpu_another_process_writes_the_same_files(geodiff, fresh, made
         assert len({tuple(report.pop("seconds")) for report in reports}) == 1  # the same stages
         assert reports[0] == reports[1]
     assert [row["result"] for row in rows_of()] == ["done"] * 3
+
+
+def test_a_process_that_writes_and_has_ended_ends_the_run_and_the_same_command_goes_on(
+    geodiff, fresh, beside_gpu, monkeypatch
+):
+    def end(call, function, place):
+        if place.path.name == "b":
+            call(os._exit, 9)
+
+    beside_gpu(end)
+    answer = geodiff(*COMMAND)
+    assert answer.code == 2 and answer.err.count("geodiff: ") == 1
+    assert "A process that writes results has ended (exit code 9). Is there enough memory?" in answer.err
+    assert Path("out/a/report.json").exists() and not Path("out/b").exists()
+    monkeypatch.setattr(many, "leaves_cpu_free", lambda device: False)
+    answer = geodiff(*COMMAND)
+    assert answer.code == 0 and "0 failed" in answer.out and "0 there" not in answer.out
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no signal to a thread")
+def test_ctrl_c_while_several_processes_write_leaves_whole_folders(geodiff, fresh, beside_gpu, monkeypatch):
+    def interrupt(call, function, place):
+        if place.path.name == "a":
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    beside_gpu(interrupt)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    answer = geodiff(*COMMAND)
+    signal.signal(signal.SIGINT, before)
+    assert answer.code == 130
+    folders = [path for path in Path("out").iterdir() if path.is_dir()]
+    assert Path("out/a") in folders and not list(fresh.rglob("*partial*"))
+    for folder in folders:
+        assert set(os.listdir(folder)) == set(report_of(folder)["files"]["names"])
+    monkeypatch.setattr(many, "leaves_cpu_free", lambda device: False)
+    answer = geodiff(*COMMAND)
+    assert answer.code == 0 and "0 failed" in answer.out and f"{len(folders)} there" in answer.out
+
+
+@pytest.mark.parametrize(
+    ("device", "cores", "pairs", "count"),
+    [("cuda", 16, 100, 3), ("cuda", 5, 100, 2), ("cuda", 1, 100, 1), ("cuda", 16, 2, 2), ("cpu", 16, 9, 0)],
+)
+def test_no_more_processes_write_than_cores_and_pairs_allow(monkeypatch, device, cores, pairs, count):
+    monkeypatch.setattr(many, "available_cores", lambda: cores)
+    started = []
+    monkeypatch.setattr(many, "SeparateProcesses", lambda module, count: started.append(count))
+    many.Stages(DepthOptions(left=Path("left")), torch.device(device), pairs=pairs)
+    assert started == ([count] if count else [])
 
 
 def test_finished_pairs_are_skipped_and_overwrite_does_them_anew(geodiff, finished):

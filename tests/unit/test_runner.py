@@ -1,5 +1,6 @@
 """Jobs that are resumed, divided into shards, killed and that fail."""
 
+import json
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 
 from geodiff_plugin import InputError
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard, fingerprint
-from geodiff_plugin.jobs.runner import Runner
+from geodiff_plugin.jobs.runner import Runner, SideBySide
 
 CHILD = """
 import sys, time
@@ -141,6 +142,64 @@ def test_stages_work_side_by_side_and_let_go_of_every_item(tmp_path):
     assert threads.isdisjoint({threading.get_ident()}) and len(threads) == 1
     assert {0, 1, 2} <= set(released) and len(released) == len(set(released))
     assert len((tmp_path / "job.jsonl").read_bytes().splitlines()) == 2
+
+
+def test_several_threads_of_a_stage_work_at_once_and_records_keep_the_order_of_items(tmp_path):
+    third, ended = threading.Event(), []
+
+    def work(item):
+        if item.payload == 0:
+            assert third.wait(60)  # so others are worked on meanwhile
+        if item.payload == 2:
+            third.set()
+        ended.append(item.payload)
+        return {"square": item.payload**2}
+
+    records = go(tmp_path, SideBySide(work, 3), 7, stages=2)
+    assert [record["square"] for record in records] == [n**2 for n in range(7)]
+    written = [json.loads(line)["key"] for line in (tmp_path / "job.jsonl").read_text().splitlines()]
+    assert written == [f"item{n}" for n in range(7)]
+    assert ended.index(2) < ended.index(0) and sorted(ended) == list(range(7))
+
+
+@pytest.mark.parametrize("error", [KeyError("defect"), KeyboardInterrupt()])
+def test_what_ends_the_run_in_one_of_several_threads_lets_the_others_end_their_items(tmp_path, error):
+    begun, ended, released, others = [], [], [], threading.Barrier(3, timeout=60)
+
+    def work(item):
+        begun.append(item.payload)
+        if item.payload in (1, 2, 3):
+            others.wait()
+        if item.payload == 1:
+            raise error
+        ended.append(item.payload)
+        return {}
+
+    with pytest.raises(type(error)):
+        go(tmp_path, SideBySide(work, 3), 9, stages=2, release=lambda item: released.append(item.payload))
+    assert {0, 2, 3} <= set(ended) and set(begun) - {1} == set(ended)
+    assert set(begun) <= set(released) and len(released) == len(set(released))
+    assert len((tmp_path / "job.jsonl").read_bytes().splitlines()) == 1
+
+
+def test_a_quick_stage_waits_until_the_next_one_takes_what_it_has_done(tmp_path):
+    quick, ahead = [], []
+
+    def first(item):
+        quick.append(item.payload)
+        return item
+
+    def second(item):
+        time.sleep(0.02)  # the first could do all items meanwhile
+        ahead.append(len(quick) - item.payload)
+        return item
+
+    items = [Item(f"item{n}", n) for n in range(12)]
+    with Journal(tmp_path / "job.jsonl") as journal:
+        last = SideBySide(lambda item: {"n": item.payload}, 9)
+        records = Runner(items, journal, progress=False).run(first, second, last)
+    assert [record["n"] for record in records] == list(range(12))
+    assert max(ahead) <= 3  # in the second, waiting for it, and in the first
 
 
 def start(folder, pause=0.05, stages=1):

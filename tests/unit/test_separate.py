@@ -8,6 +8,8 @@ import subprocess
 import sys
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
+from itertools import permutations
 
 import numpy as np
 import psutil
@@ -16,7 +18,7 @@ import torch
 
 from geodiff_plugin._checks import InputFileError, noted, warn
 from geodiff_plugin.jobs.failures import DiskFull, full_disk
-from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcess
+from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcess, SeparateProcesses
 from geodiff_plugin.messages import Message
 
 
@@ -88,6 +90,33 @@ def test_a_killed_process_is_said_so_and_closing_it_is_no_error():
     with pytest.raises(ProcessEnded):
         process.call(math.sqrt, 4)
     process.close()
+
+
+def wait_for(path: str) -> int:
+    """The process's number, once another process has made the file."""
+    until = time.monotonic() + 60
+    while not os.path.exists(path):
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    return os.getpid()
+
+
+def make_and_wait(made: str, awaited: str) -> int:
+    open(made, "w").close()
+    return wait_for(awaited)
+
+
+def test_several_processes_work_at_once_and_the_loss_of_one_is_said(tmp_path):
+    first, second = str(tmp_path / "first"), str(tmp_path / "second")
+    processes = SeparateProcesses(__name__, 2)
+    with ThreadPoolExecutor(2) as pool:  # each waits for the other
+        calls = [
+            pool.submit(processes.call, make_and_wait, *files) for files in permutations((first, second))
+        ]
+        assert len({call.result() for call in calls}) == 2
+    with pytest.raises(ProcessEnded, match=r"A process that writes results has ended \(exit code 3\)"):
+        processes.call(os._exit, 3)
+    processes.close()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no groups of processes")
