@@ -39,7 +39,8 @@ from geodiff_plugin.runtime.machine import pick_device
 
 #: What became of every pair.
 JOURNAL = ".pairs.jsonl"
-#: Processes that write, at most: they keep up with a GPU, and each has Python, torch and a pair in memory.
+#: Processes that write, at most: to write a pair takes up to twice as long as to guide it on a GPU, and one
+#: more makes up for pairs that take longer. Each has Python, torch and a pair in memory.
 MOST_WRITERS = 3
 #: Cores that they leave to the threads that read, make evidence and guide.
 CORES_OF_STAGES = 3
@@ -103,8 +104,8 @@ class Stages:
 
     A ``pipe`` that is not given is loaded when the first pair has been read; ``among`` stages compute at the
     same time and share the cores; ``tell`` hears which prior it is, and what was assumed. Beside a GPU
-    processes of their own write ``pairs`` pairs, started at once, as the prior takes longer to load than they
-    to start: a thread that writes would keep the others, which launch kernels, from Python's lock.
+    processes of their own write the ``pairs`` that there are: a thread that writes would keep the others,
+    which launch kernels, from Python's lock. They start at once, while the prior is loaded.
     """
 
     def __init__(
@@ -192,7 +193,7 @@ class Stages:
 
 
 def _writers(device: torch.device, pairs: int) -> int:
-    """How many processes write so many pairs; none where the device leaves them no core."""
+    """How many processes write so many pairs; none where the stages before need all cores."""
     if not leaves_cpu_free(device):
         return 0
     return min(pairs, MOST_WRITERS, max(1, available_cores() - CORES_OF_STAGES))
