@@ -64,8 +64,9 @@ class Beside(Generic[T]):
     """The answer of a function that a thread of its own works out while the caller goes on.
 
     A guided call on CUDA makes its evidence like this, beside the network's first steps, which are not
-    guided; in it the pose check, which keeps the CPU busy while the GPU matches; and after it the matches of
-    rows, which only the result asks for, and what the verdict asks of them. The thread has the caller's
+    guided; in it the features of the pose check, which keep the CPU busy while the GPU matches; and after it
+    the rest of the check and the matches of rows, which only the result asks for, and what the verdict asks
+    of them. The thread has the caller's
     context variables and takes no gradients. On other devices both would compete for the same cores, so the
     function is called at once.
 
@@ -97,6 +98,11 @@ class Beside(Generic[T]):
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="geodiff-evidence")
         self._answer = self._pool.submit(work)
         self._pool.shutdown(wait=False)  # the thread ends with its work, even if nobody asks for the answer
+
+    @classmethod
+    def known(cls, answer: T) -> Beside[T]:
+        """An answer that is there already."""
+        return cls(lambda: answer, torch.device("cpu"))
 
     def result(self) -> T:
         """The answer, or what the function raised; the caller's stream then waits for the thread's."""

@@ -11,6 +11,8 @@ from diffusers.configuration_utils import ConfigMixin, register_to_config
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
+from geodiff_plugin.pose.refine import CheckedViews, measure_fit, refine_views
+from geodiff_plugin.types import PosedViews
 
 SCHEDULER = {
     "beta_schedule": "scaled_linear",
@@ -175,3 +177,8 @@ def make_oracle(relative: np.ndarray, prediction_type: str = "depth") -> Marigol
     parts = unet, OracleVAE(), DDIMScheduler(**SCHEDULER | clean), make_text_encoder(), make_tokenizer()
     told = {"default_denoising_steps": 2, "default_processing_resolution": 0}
     return quiet(MarigoldDepthPipeline(*parts, prediction_type=prediction_type, **told))
+
+
+def checked_views(posed: PosedViews, measured: bool = False) -> CheckedViews:
+    """What ``refine_views`` makes of views whose fit is measured first."""
+    return refine_views(posed, measure_fit(posed), measured)

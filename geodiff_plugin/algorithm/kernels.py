@@ -22,7 +22,7 @@ from geodiff_plugin.algorithm import solver
 from geodiff_plugin.algorithm.solver import FieldSystem, RobustField, RobustSystem
 
 #: Pixels of a tile.
-TILE = 512
+TILE = 1024
 #: Pixels of a grid that one program solves by itself: it waits for no other.
 ALONE = 1024
 #: Warps of a program.

@@ -29,8 +29,8 @@ class Evidence:
     points: Matches | None = None  # depths that the user knows, in the form of matches
     reliable: Matches | None = None  # ``matches`` as points for the search, where enough are reliable
     rows: Beside[RowMatches] | None = None  # of a rectified pair, at the image's size; act 3 asks for them
-    pose: PoseReport | None = None  # how the poses fit
-    warnings: tuple[Message, ...] = ()
+    report: Beside[PoseReport] | None = None  # how the poses fit, where act 3 asks
+    noticed: tuple[Message, ...] = ()  # what was noticed beside it
 
     def within(self, valid: Tensor) -> Self:
         """The same with confidence 0 where a prior is not ``valid``, on any grid; points stay if none is."""

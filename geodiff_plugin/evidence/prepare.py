@@ -21,11 +21,11 @@ from geodiff_plugin.evidence.inputs import Inputs
 from geodiff_plugin.matching import Matches, clean
 from geodiff_plugin.matching.matches import read_above
 from geodiff_plugin.matching.rows import RowMatches, RowPictures, match_rows, rectified_pictures
-from geodiff_plugin.messages import Message, distinct
+from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.pose.refine import refine_views, unchecked
+from geodiff_plugin.pose.refine import measure_fit, refine_views, unchecked
 from geodiff_plugin.scale.points import RELIABLE, reliable_matches
-from geodiff_plugin.types import PosedViews, PoseReport
+from geodiff_plugin.types import PosedViews
 
 
 def cleaned(images: Sequence[Tensor], config: GuidanceConfig) -> Sequence[Tensor]:
@@ -51,33 +51,31 @@ def make_evidence(
         return prepare_evidence(posed, points, config)
     posed = _with_clean_images(posed, config)
     if config.pose == "given":
-        return prepare_evidence(posed, points, config, unchecked(posed.views))
-    check = Beside(lambda: refine_views(posed, measured_baseline), left_01.device)
-    as_given = None
-    try:
-        if leaves_cpu_free(left_01.device):
-            # The check keeps the CPU busy; meanwhile the device matches under the given poses, as most fit.
-            with suppress(InputError):  # raised again below, unless a refined pose mends it
-                as_given = prepare_evidence(posed, points, config)
-        used, report = check.result()
-    finally:
-        check.close()
-    if as_given is not None and all(one is other for one, other in zip(used, posed.views, strict=True)):
-        return replace(as_given, pose=report, warnings=distinct(report.warnings, as_given.warnings))
-    return prepare_evidence(posed._replace(views=used), points, config, report)
+        report = Beside.known(unchecked(posed.views))
+        return replace(prepare_evidence(posed, points, config), report=report)
+    measured = Beside(lambda: measure_fit(posed), left_01.device)
+    evidence = None
+    if leaves_cpu_free(left_01.device):
+        # Matching features keeps the CPU busy; meanwhile the device matches the views as given, as most fit.
+        with suppress(InputError):  # raised again below, unless a refined pose mends it
+            evidence = prepare_evidence(posed, points, config)
+    fit, views = measured.result(), posed.views
+    if fit.fits:  # what else there is to find changes no view, and act 3 is the first to ask
+        report = Beside(lambda: refine_views(posed, fit).report, left_01.device)
+    else:
+        views, found = refine_views(posed, fit, measured_baseline)
+        report = Beside.known(found)
+    if evidence is None or any(one is not other for one, other in zip(views, posed.views, strict=True)):
+        evidence = prepare_evidence(posed._replace(views=views), points, config)
+    return replace(evidence, report=report)
 
 
-def prepare_evidence(
-    native: PosedViews, points: Tensor | None, config: GuidanceConfig, pose: PoseReport | None = None
-) -> Evidence:
-    """Cost volume, matches and points of one image and its right views, each of native size.
-
-    ``pose`` reports how the poses fit and whether they were refined.
-    """
+def prepare_evidence(native: PosedViews, points: Tensor | None, config: GuidanceConfig) -> Evidence:
+    """Cost volume, matches and points of one image and its right views, each of native size."""
     needs_matches = config.needs_matches(points is not None)
     grid = matching.to_grid(native, config.sweep_pixels)
     volume, matches, known_points, rows = None, None, None, None
-    warnings: list[Message] = [] if pose is None else list(pose.warnings)
+    noticed: list[Message] = []
     left_out = 0
     if points is not None:
         known_points, left_out = matching.points_to_matches(points, native.K_left, native.size, grid.size)
@@ -88,10 +86,10 @@ def prepare_evidence(
             matches = matching.match_volume(volume)
             rows = rows_beside(pictures, matches, known_points)
         if matching.inverse_pose_preferred(native, matches):
-            warnings.append(INVERSE)
+            noticed.append(INVERSE)
     if left_out:
         sentence = f"{left_out} points outside the left image are left out: is their frame right?"
-        warnings.append(Message("points.outside", sentence))
+        noticed.append(Message("points.outside", sentence))
     evidence = Evidence(
         native,
         grid,
@@ -100,8 +98,7 @@ def prepare_evidence(
         known_points,
         reliable=None if matches is None else reliable_matches(matches),
         rows=rows,
-        pose=pose,
-        warnings=distinct(warnings),  # two checks may find the same mistake
+        noticed=tuple(noticed),
     )
     _read_back(evidence)
     return evidence

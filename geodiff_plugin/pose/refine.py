@@ -25,6 +25,7 @@ from geodiff_plugin.pose.solve import is_rig, nearby_poses, settle_poses
 from geodiff_plugin.pose.tearing import find_tear
 from geodiff_plugin.pose.tracks import (
     FEWEST,
+    GreyImage,
     Tracks,
     behind_infinity,
     coarse_depth,
@@ -110,43 +111,70 @@ class _Misfit:
     measured: bool  # whether the lengths of the baselines are
 
 
-def refine_views(posed: PosedViews, measured: bool = False) -> CheckedViews:
-    """Check the poses against the images, and refine them where they do not fit.
+@dataclass(frozen=True, eq=False)
+class PoseFit:
+    """How the given poses of V right views fit the matches of their pictures."""
+
+    views: Sequence[GreyImage]  # left one first
+    tracks: Tracks  # by SIFT
+    given: np.ndarray  # (V, 4, 4) T_right_from_left
+    residual_px: np.ndarray  # (V,) median distance of matches from their epipolar lines, NaN where too few
+    rig: bool  # a rectified one
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there are enough matches."""
+        return bool(self.tracks.seen.sum(1).max(initial=0) >= FEWEST)
+
+    @property
+    def limit_px(self) -> float:
+        """Residual up to which a pose fits."""
+        return FITS_PX if self.rig else POSED_FITS_PX
+
+    @property
+    def fits(self) -> bool:
+        """Whether no view misses by more: then ``refine_views`` leaves all views as they are."""
+        return not (self.residual_px > self.limit_px).any()
+
+
+def measure_fit(posed: PosedViews) -> PoseFit:
+    """Match the pictures, and measure how far the matches are from their epipolar lines."""
+    views, given = grey_views(posed), _poses(posed.views)
+    tracks = sparse_tracks(views)
+    return PoseFit(views, tracks, given, median_residuals(tracks, given), is_rig(tracks, given))
+
+
+def refine_views(posed: PosedViews, fit: PoseFit, measured: bool = False) -> CheckedViews:
+    """Check the poses of a known fit against the images, and refine them where they do not fit.
 
     ``measured`` baselines keep their lengths, as those of a rectified rig do; others are weighed against the
     depth of the scene. The given views are returned if they fit, if there are too few matches, if a mistake
     explains the misfit, or if no better pose is near. A rectified rig is refined only if the dense matches
     miss it as well.
     """
-    rights = posed.views
-    views, given = grey_views(posed), _poses(rights)
-    sparse = sparse_tracks(views)
-    counts = sparse.seen.sum(1)
-    if counts.max(initial=0) < FEWEST:
+    rights, sparse, given, before = posed.views, fit.tracks, fit.given, fit.residual_px
+    if not fit.is_known:
         return CheckedViews(rights, unchecked(rights, "not checked"))
-    before, poses = median_residuals(sparse, given), _as_E(given)
-    residual_px = tuple(before.tolist())
-    report = PoseReport("fits", poses, poses, residual_px, residual_px, tuple(map(float, counts)))
-    rig = is_rig(sparse, given)
-    fits_px = FITS_PX if rig else POSED_FITS_PX
-    fits = not (before > fits_px).any()
-    near = given if fits else nearby_poses(sparse, given, before)
-    greys = [grey for grey, _ in views]
+    residual_px, poses = tuple(before.tolist()), _as_E(given)
+    matches = tuple(map(float, sparse.seen.sum(1)))
+    report = PoseReport("fits", poses, poses, residual_px, residual_px, matches)
+    near = given if fit.fits else nearby_poses(sparse, given, before)
+    greys = [grey for grey, _ in fit.views]
     report = _with_contradictions(_with_pictures(report, posed, greys), sparse, given)
     report = replace(report, exchangeable=exchangeable(sparse, given, near, [grey.shape for grey in greys]))
     if mistakes := _messages(sparse, find_mistake, given, near):
         return CheckedViews(rights, replace(report, status="mistaken", warnings=mistakes))
-    if fits:
+    if fit.fits:
         return CheckedViews(rights, report)
-    depth_m = coarse_depth(posed._replace(views=_applied(rights, near)), views[0][0].shape)
-    tracks = merge_tracks([sparse, dense_tracks(views, depth_m, near)])
-    if rig and not ((all_px := median_residuals(tracks, given)) > fits_px).any():
+    depth_m = coarse_depth(posed._replace(views=_applied(rights, near)), greys[0].shape)
+    tracks = merge_tracks([sparse, dense_tracks(fit.views, depth_m, near)])
+    if fit.rig and not ((all_px := median_residuals(tracks, given)) > fit.limit_px).any():
         # The few sparse matches missed by chance: a calibration is not changed for what all do not show.
         residual_px, matches = tuple(all_px.tolist()), tuple(map(float, tracks.seen.sum(1)))
         report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
         return CheckedViews(rights, report)
-    sizes = [(image.shape[0], image.shape[1]) for image, _ in views[1:]]
-    return _refined(_Misfit(rights, sizes, tracks, given, near, fits_px, rig, measured), report)
+    sizes = [(image.shape[0], image.shape[1]) for image in greys[1:]]
+    return _refined(_Misfit(rights, sizes, tracks, given, near, fit.limit_px, fit.rig, measured), report)
 
 
 def _with_pictures(report: PoseReport, posed: PosedViews, greys: Sequence[np.ndarray]) -> PoseReport:

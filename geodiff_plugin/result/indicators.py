@@ -14,9 +14,10 @@ from geodiff_plugin._strips import row_strips
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.geometry import constant_like, image_size, is_rectified
 from geodiff_plugin.matching import Matches
+from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.pose.mistakes import INVERSE
 from geodiff_plugin.pose.tracks import LONG_SIDE
-from geodiff_plugin.types import Indicators, PosedViews
+from geodiff_plugin.types import Indicators, PosedViews, PoseReport
 
 #: Matches above this confidence count.
 CONFIDENT = 0.5
@@ -121,6 +122,17 @@ def _measure_matches(matches: Matches, depth_m: Tensor, planes: Tensor | None) -
     return numbers | {"off_matches": off.flatten().nanmedian(), "off_where": at.sum()}
 
 
+def pose_of(evidence: Evidence) -> PoseReport | None:
+    """How the poses fit; ``None`` without a right view. On CUDA the check may not have ended before."""
+    return None if evidence.report is None else evidence.report.result()
+
+
+def warnings_of(evidence: Evidence) -> tuple[Message, ...]:
+    """What the check of the poses and the matching warn of; both may find the same mistake."""
+    pose = pose_of(evidence)
+    return distinct(() if pose is None else pose.warnings, evidence.noticed)
+
+
 def indicators_of(
     evidence: Evidence, numbers: Mapping[str, float], has_unit: bool = True, **further: Any
 ) -> Indicators:
@@ -129,7 +141,7 @@ def indicators_of(
     ``further`` are indicators that are known already. ``has_unit``: lengths are in metres, so that the
     length of a baseline means something.
     """
-    pose, native = evidence.pose, evidence.native
+    pose, native = pose_of(evidence), evidence.native
     known: dict[str, Any] = {name: numbers[name] for name in ("matched", "cover") if name in numbers}
     known |= {"points": round(numbers["points"])} if "points" in numbers else {}
     known |= _of_matches(numbers)
@@ -159,7 +171,7 @@ def indicators_of(
         **known,
         view_deg=2.0 * math.degrees(math.atan(half_width / float(native.K_left[0, 0]))),
         same=_is_same(numbers),
-        inverse_fits=any(message.code == INVERSE.code for message in evidence.warnings),
+        inverse_fits=any(message.code == INVERSE.code for message in warnings_of(evidence)),
     )
 
 

@@ -14,6 +14,7 @@ from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.estimate import NO_UNIT
 from geodiff_plugin.result.finish import ImageResult
+from geodiff_plugin.result.indicators import pose_of, warnings_of
 from geodiff_plugin.scale.space import joined
 from geodiff_plugin.types import MetricDepthOutput, StepReport
 
@@ -45,7 +46,7 @@ def stack_results(
     if as_numpy:
         maps, further = map(_as_arrays, read[1:])
     K = torch.stack([result.K for result in results])
-    poses, estimated = [result.evidence.pose for result in results], guidance.estimated
+    poses, estimated = [pose_of(result.evidence) for result in results], guidance.estimated
     output = MetricDepthOutput(
         prediction=maps.pop("depth_m"),
         **maps,
@@ -155,4 +156,4 @@ def _messages(result: ImageResult) -> list[Message]:
         )
         messages.append(Message("views.overlap", sentence))
     # Mistakes of a pose are reasons of the verdict already.
-    return messages + [message for message in result.evidence.warnings if not message.forbids_trust]
+    return messages + [message for message in warnings_of(result.evidence) if not message.forbids_trust]

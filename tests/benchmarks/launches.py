@@ -69,6 +69,7 @@ WITH_KERNELS = (
 #: Functions, and methods as ``Class.method``, whose operations are shown apart; each without those below it.
 STAGES = (
     "clean",
+    "measure_fit",
     "refine_views",
     "build_cost_volume",
     "pilot_volume",

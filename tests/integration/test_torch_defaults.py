@@ -8,12 +8,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin.pose.refine import refine_views
 from geodiff_plugin.runtime.hooks import images_in_float32
 from geodiff_plugin.types import CameraView, PosedViews
 from tests.contracts.tiny_priors import TINY, make_e2e_ft
 from tests.scenes import render_pair
-from tests.tiny import guided_call, plane_pair
+from tests.tiny import checked_views, guided_call, plane_pair
 
 DEFAULTS = ("meta", torch.float64, torch.bfloat16)
 WEIGHTS = {"photometric": 1.0, "prior_pull": 0.01, "anchor": 0.1}
@@ -77,7 +76,7 @@ def test_a_refined_pose_does_not_depend_on_them(rendered):
 
     def compute():
         T = torch.from_numpy(np.linalg.inv(E)).to(torch.float32)
-        found, report = refine_views(PosedViews(left, (CameraView(right, K.float(), T),), K.float()))
+        found, report = checked_views(PosedViews(left, (CameraView(right, K.float(), T),), K.float()))
         assert report.status == "refined"
         return found[0].T_right_from_left.numpy()
 

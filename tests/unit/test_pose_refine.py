@@ -1,6 +1,7 @@
 """Poses as given against matches: residuals, refinement, straightening, the usual mistakes."""
 
 import re
+import threading
 from dataclasses import replace
 
 import cv2
@@ -11,6 +12,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance
+from geodiff_plugin._threads import Beside
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.matching.planes import Parallax
 from geodiff_plugin.pose import refine
@@ -18,7 +20,7 @@ from geodiff_plugin.pose import tracks as tracks_module
 from geodiff_plugin.pose.lens import remaining_distortion
 from geodiff_plugin.pose.mistakes import _candidates, exchangeable, find_mistake
 from geodiff_plugin.pose.moving import moved_share
-from geodiff_plugin.pose.refine import depths_apart, fit_displacement, refine_views, straightened
+from geodiff_plugin.pose.refine import depths_apart, fit_displacement, straightened
 from geodiff_plugin.pose.solve import PosePrior, is_rig, settle_poses, solve_poses
 from geodiff_plugin.pose.tracks import (
     Tracks,
@@ -33,6 +35,7 @@ from geodiff_plugin.pose.tracks import (
 from geodiff_plugin.result.indicators import indicators_of
 from geodiff_plugin.types import CameraView, PosedViews
 from tests.scenes import render_pair
+from tests.tiny import checked_views
 
 K = np.array([[500.0, 0, 255.5], [0, 500.0, 191.5], [0, 0, 1]])
 SIZE = (384, 512)
@@ -291,7 +294,7 @@ def test_a_principal_point_that_is_off_is_seen_in_pictures_of_far_things() -> No
         K_right[0, 2] -= off_px
         T = torch.from_numpy(np.linalg.inv(E)).float()
         rights = (CameraView(rig.right.image_01.float(), K_right, T),)
-        shares.append(refine_views(PosedViews(left, rights, K_left)).report.behind_infinity)
+        shares.append(checked_views(PosedViews(left, rights, K_left)).report.behind_infinity)
     assert shares[0] < 0.02 and shares[1] > 0.2
 
 
@@ -414,15 +417,21 @@ def test_a_tracker_keeps_the_scene_and_a_measured_baseline_its_length(pair) -> N
     wrong = about @ pose((1.0, -1.2, 0.4), (0, 0, 0)) @ np.linalg.inv(about) @ E
     length, given_length = (np.linalg.norm(P[:3, 3]) for P in (E, wrong))
     assert abs(np.log(given_length / length)) > 0.1, "else nothing is tested"
-    _, kept = refine_views(posed(pair, wrong), measured=True)
+    _, kept = checked_views(posed(pair, wrong), measured=True)
     assert kept.status == "refined" and kept.scale_spread is None
     assert np.linalg.norm(kept.E[0][:3, 3]) == pytest.approx(given_length, rel=0.02)
-    _, report = refine_views(posed(pair, wrong))
+    _, report = checked_views(posed(pair, wrong))
     moved = np.log(np.linalg.norm(report.E[0][:3, 3]) / given_length)
     assert 0.2 < moved / np.log(length / given_length) < 1.2
     assert report.scale_spread > 0.05  # even where both lengths agree
     native = posed(pair, wrong)
-    seen = Evidence(native, grid=native, volume=None, matches=None, pose=report)
+    seen = Evidence(
+        native,
+        grid=native,
+        volume=None,
+        matches=None,
+        report=Beside.known(report),
+    )
     assert indicators_of(seen, {}).scale_spread == report.scale_spread
     assert np.isnan(indicators_of(seen, {}, has_unit=False).scale_spread)
 
@@ -445,7 +454,7 @@ def test_views_are_used_as_given_where_no_better_pose_is_near(pair) -> None:
         (posed(pair, inverse), "mistaken", "world-to-camera"),
         (nothing, "not checked", None),
     ):
-        used, report = refine_views(inputs)
+        used, report = checked_views(inputs)
         assert report.status == status and bool(report.warnings) == (said is not None)
         assert said is None or re.search(said, report.warnings[0])
         assert used == inputs.views
@@ -458,7 +467,7 @@ def test_everything_downstream_sees_the_refined_pose(pair) -> None:
     left = pair.left.image_01.float()[None]
     (refined,) = GeometryGuidance(pair.right.image_01, Ks, wrong).prepare(left)
     (given,) = GeometryGuidance(pair.right.image_01, Ks, wrong, pose="given").prepare(left)
-    report, E = refined.pose, np.linalg.inv(refined.native.views[0][2].numpy())
+    report, E = refined.report.result(), np.linalg.inv(refined.native.views[0][2].numpy())
     assert report.status == "refined" and report.residual_px[0] < 0.3 < 1.0 < report.residual_px_given[0]
     assert "px off their epipolar lines" in report.warnings[0]
     assert angle_deg(report.E[0][:3, :3].T @ true[:3, :3]) < 0.2
@@ -468,7 +477,7 @@ def test_everything_downstream_sees_the_refined_pose(pair) -> None:
     as_refined = Parallax(refined.grid.K_left, K_right, T, refined.grid.size, "E")
     found_px = refined.volume.parallax[0].median_shift(0.5)
     assert found_px == pytest.approx(as_refined.median_shift(0.5), rel=1e-5)
-    assert given.pose.status == "given"
+    assert given.report.result().status == "given"
     assert np.allclose(np.linalg.inv(given.native.views[0][2].numpy()), wrong, atol=1e-5)
 
 
@@ -482,9 +491,31 @@ def test_evidence_made_beside_the_check_of_the_poses_is_the_same(pair, monkeypat
     for module in ("_threads", "evidence.prepare"):
         monkeypatch.setattr(f"geodiff_plugin.{module}.leaves_cpu_free", lambda device: True)
     (beside,) = guidance.prepare(left)
-    assert alone.pose.status == beside.pose.status == status and alone.warnings == beside.warnings
+    reports = [each.report.result() for each in (alone, beside)]
+    assert all(report.status == status for report in reports)
+    assert reports[0].warnings == reports[1].warnings and alone.noticed == beside.noticed
     assert torch.equal(alone.matches.inverse_depth, beside.matches.inverse_depth)
     assert torch.equal(alone.volume.levels, beside.volume.levels)
+
+
+def test_evidence_of_poses_that_fit_is_there_before_all_is_known_about_them(pair, monkeypatch) -> None:
+    """As on CUDA: what else the check finds is for act 3, so denoising does not wait for it."""
+    asked = threading.Event()
+
+    def patient(*args):
+        assert asked.wait(60)
+        return refine.refine_views(*args)
+
+    monkeypatch.setattr("geodiff_plugin.evidence.prepare.refine_views", patient)
+    for module in ("_threads", "evidence.prepare"):
+        monkeypatch.setattr(f"geodiff_plugin.{module}.leaves_cpu_free", lambda device: True)
+    guidance = GeometryGuidance(
+        pair.right.image_01, (pair.K_left.numpy(), pair.K_right.numpy()), pair.E.numpy()
+    )
+    (made,) = guidance.prepare(pair.left.image_01.float()[None])
+    assert made.matches is not None and not asked.is_set()
+    asked.set()
+    assert made.report.result().status == "fits"
 
 
 @pytest.mark.parametrize("seed", [pytest.param(2, marks=pytest.mark.slow), 6])
@@ -499,7 +530,7 @@ def test_the_rows_of_a_rig_that_has_drifted_agree_again(seed: int) -> None:
     T = torch.from_numpy(np.linalg.inv(rig.E.numpy())).float()
     rights = (CameraView(drifted.right.image_01.float(), rig.K_right.float(), T),)
     views = PosedViews(drifted.left.image_01.float(), rights, rig.K_left.float())
-    _, report = refine_views(views, measured=True)
+    _, report = checked_views(views, measured=True)
     assert report.status == "refined"
     assert report.residual_px[0] < 0.3 < 0.45 < report.residual_px_given[0]
     assert np.linalg.norm(report.E[0][:3, 3]) == pytest.approx(float(rig.E[0, 3]), rel=0.03)
@@ -518,7 +549,7 @@ def test_a_calibrated_rig_keeps_its_calibration_where_all_matches_fit_it(monkeyp
         return replace(sparse, right_px=sparse.right_px + np.array([0.0, 0.6]))
 
     monkeypatch.setattr(refine, "sparse_tracks", missing)
-    used, report = refine_views(given)
+    used, report = checked_views(given)
     assert report.status == "fits" and used[0] is views[0]
     assert report.residual_px_given[0] < refine.FITS_PX and not report.warnings
 
@@ -532,7 +563,7 @@ def test_a_rig_is_not_told_that_another_pose_fits_as_well(monkeypatch) -> None:
         right = torch.roll(rig.right.image_01.float(), 2, 1)  # two pixels down, so that neither pose fits
         T = torch.from_numpy(np.linalg.inv(E)).float()
         views = (CameraView(right, rig.K_right.float(), T),)
-        _, report = refine_views(PosedViews(rig.left.image_01.float(), views, rig.K_left.float()))
+        _, report = checked_views(PosedViews(rig.left.image_01.float(), views, rig.K_left.float()))
         messages = [m for m in report.warnings if m.code == "pose.undetermined"]
         assert bool(messages) == told and all(m.forbids_trust for m in messages), report
         assert (report.depth_spread > 0.0) is told

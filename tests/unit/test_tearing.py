@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import torch
 
-from geodiff_plugin.pose.refine import refine_views
 from geodiff_plugin.pose.tearing import find_tear
 from geodiff_plugin.result.verdict import judge
 from geodiff_plugin.types import CameraView, Indicators, PosedViews, Tear
 from tests.scenes import render_pair
+from tests.tiny import checked_views
 
 WIDTH, HEIGHT = 320, 240
 
@@ -85,7 +85,7 @@ def test_a_torn_pair_is_reported_and_not_trusted():
     moved = right.clone()
     moved[:, 80:160] = moved[:, 80:160].roll(15, -1)
     for image, tear in ((right, None), (moved, [Tear(1, 80, 15), Tear(1, 160, -15)])):
-        _, report = refine_views(PosedViews(left, (CameraView(image, rig.K_right.float(), T),), K))
+        _, report = checked_views(PosedViews(left, (CameraView(image, rig.K_right.float(), T),), K))
         assert report.tear in (tear or [None])
     verdict = judge(Indicators(tear=Tear(1, 80, -15)))
     assert "right picture is torn: from row 80 on it is moved by 15 px to the left" in verdict.sentence
