@@ -30,7 +30,7 @@ from geodiff_plugin.result.ensemble import ensemble_metric
 from geodiff_plugin.result.output import image_labels
 from geodiff_plugin.runtime.codec import MapCodec, ProcessingGrid, tiny_autoencoder
 from geodiff_plugin.runtime.graphs import FasterNetworks
-from geodiff_plugin.runtime.hooks import Exclusive, device_of, layers_of, networks_of
+from geodiff_plugin.runtime.hooks import Exclusive, Layers
 from geodiff_plugin.runtime.noise_levels import check_scheduler
 from geodiff_plugin.runtime.run import GuidedRun, StepCallback
 from geodiff_plugin.types import MetricDepthOutput
@@ -131,12 +131,13 @@ class GuidedCall(_Stock):
         steps, rounds = count_guided_steps(self, guidance, asked)
         resampling = call["resample_method_output"] or "bilinear"
         call |= {"num_inference_steps": steps, "resample_method_output": resampling}
-        _check_guidable(self, prior, guidance)
+        layers = Layers.of(self)
+        _check_guidable(self, prior, guidance, layers)
         tiny = tiny_autoencoder(self, guidance.config.decoder)
         unlocked = None if callback is None else held.without(callback)
         if prior.deterministic and call["ensemble_size"] > 1:
             call |= _one_member(call)
-        device = self._execution_device
+        device = layers.device or super()._execution_device
         if line := compilation_ahead(device):
             logging.getLogger(__name__).info(line)
         lefts_01 = lefts_01.to(device)
@@ -179,7 +180,7 @@ class GuidedCall(_Stock):
         """As stock, which looks through all layers several times; while guided, where the run is."""
         if self._guided_run is not None:
             return self._guided_run.device
-        return device_of(self) or super()._execution_device
+        return Layers.of(self).device or super()._execution_device
 
     def progress_bar(self, iterable: Any = None, total: int | None = None, **kwargs: Any) -> Any:
         """Stock progress bars; while guided they are off, because the run shows one bar for all."""
@@ -283,14 +284,13 @@ def _check_arguments(call: Mapping[str, Any], images: int) -> None:
         bad_value("latents", "finite", "NaN or infinity in it")
 
 
-def _check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) -> None:
+def _check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance, layers: Layers) -> None:
     """Refuse a pipeline whose scheduler, offloading, casting or network cannot be guided as configured."""
     check_scheduler(pipe.scheduler)
     full = guidance.config.gradient == "full"
-    for network in networks_of(pipe):
+    for network, layer in layers.hooked:
         differentiated = guidance.moves_latents and (full or network is getattr(pipe, "vae", None))
-        for layer in layers_of(network):
-            _check_weights_stay(type(network).__name__, layer, differentiated)
+        _check_weights_stay(type(network).__name__, layer, differentiated)
     if full and getattr(pipe, "_all_hooks", None):
         expected = "'denoised' with enable_model_cpu_offload()"
         cure = "Decoding pushes the U-Net to the CPU before its backward pass; use gradient='denoised' or "
@@ -303,8 +303,6 @@ def _check_guidable(pipe: Any, prior: DepthPrior, guidance: GeometryGuidance) ->
 def _check_weights_stay(name: str, module: torch.nn.Module, differentiated: bool) -> None:
     """Refuse hooks that offload or cast weights before a backward pass needs them."""
     registry, hook = vars(module).get("_diffusers_hook"), vars(module).get("_hf_hook")
-    if registry is None and hook is None:
-        return
     of_diffusers = "" if registry is None else " ".join(registry.hooks)
     of_accelerate = [h for h in getattr(hook, "hooks", [hook]) if type(h).__name__ == "AlignDevicesHook"]
     if any(h.offload for h in of_accelerate) or "group_offloading" in of_diffusers:

@@ -11,6 +11,7 @@ import functools
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
@@ -23,6 +24,8 @@ from geodiff_plugin.runtime.noise_levels import trailing_timesteps
 _Answer = TypeVar("_Answer")
 _LOCKS: WeakKeyDictionary[Any, threading.RLock] = WeakKeyDictionary()
 _LOCKS_GUARD = threading.Lock()
+#: Attributes of a layer in which accelerate and diffusers keep their hooks.
+HOOKS = frozenset({"_hf_hook", "_diffusers_hook"})
 
 
 def put_channels(whole: Tensor, channels: slice, part: Tensor) -> Tensor:
@@ -50,8 +53,7 @@ def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
 @contextmanager
 def frozen_weights(pipe: Any) -> Iterator[None]:
     """Switch ``requires_grad`` off for every weight of a pipeline, so that no graph is kept for them."""
-    weights = weights_of(layer for network in networks_of(pipe) for layer in layers_of(network))
-    thawed = [weight for weight in weights if weight.requires_grad]
+    thawed = [weight for weight in Layers.of(pipe).weights if weight.requires_grad]
     for weight in thawed:
         weight.requires_grad_(False)
     try:
@@ -86,13 +88,30 @@ def weights_of(layers: Iterable[torch.nn.Module]) -> list[torch.nn.Parameter]:
     return list({id(weight): weight for weight in weights}.values())
 
 
-def device_of(pipe: Any) -> torch.device | None:
-    """Where all weights of a pipeline lie; ``None`` if not in one place, or if hooks may move them."""
-    layers = [layer for network in networks_of(pipe) for layer in layers_of(network)]
-    if any("_hf_hook" in vars(layer) or "_diffusers_hook" in vars(layer) for layer in layers):
-        return None
-    devices = {weight.device for weight in weights_of(layers)}
-    return devices.pop() if len(devices) == 1 else None
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """What a call needs to know of the layers of a pipeline, which it looks through once.
+
+    Attributes:
+        weights: their parameters, each once.
+        hooked: the layers that diffusers or accelerate has put hooks on, each with its network.
+    """
+
+    weights: list[torch.nn.Parameter]
+    hooked: list[tuple[torch.nn.Module, torch.nn.Module]]
+
+    @classmethod
+    def of(cls, pipe: Any) -> Layers:
+        """Of all networks of a pipeline."""
+        layers = [(network, layer) for network in networks_of(pipe) for layer in layers_of(network)]
+        hooked = [each for each in layers if not HOOKS.isdisjoint(vars(each[1]))]
+        return cls(weights_of(layer for _, layer in layers), hooked)
+
+    @property
+    def device(self) -> torch.device | None:
+        """Where all weights lie; ``None`` if not in one place, or if hooks may move them."""
+        devices = set() if self.hooked else {weight.device for weight in self.weights}
+        return devices.pop() if len(devices) == 1 else None
 
 
 def images_in_float32(processor: Any, known: tuple[Any, Any] = (None, None)) -> AbstractContextManager[None]:

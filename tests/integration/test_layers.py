@@ -6,7 +6,7 @@ from accelerate.hooks import ModelHook, add_hook_to_module, remove_hook_from_mod
 from diffusers import DiffusionPipeline
 
 from geodiff_plugin import enable_geometry_guidance
-from geodiff_plugin.runtime.hooks import device_of, frozen_weights, layers_of, networks_of, weights_of
+from geodiff_plugin.runtime.hooks import Layers, frozen_weights, layers_of, networks_of, weights_of
 
 
 def test_layers_and_weights_are_those_of_torch_each_once(pipe):
@@ -35,12 +35,12 @@ def test_weights_are_frozen_in_the_block_and_afterwards_as_they_were(pipe):
 def test_the_device_is_the_stock_pipelines_which_is_asked_where_hooks_or_several_devices_are(pipe):
     enable_geometry_guidance(pipe)
     stock = DiffusionPipeline._execution_device.fget
-    assert device_of(pipe) == stock(pipe) == pipe._execution_device == torch.device("cpu")
+    assert Layers.of(pipe).device == stock(pipe) == pipe._execution_device == torch.device("cpu")
     hook = ModelHook()
     hook.execution_device = torch.device("meta")
     add_hook_to_module(pipe.unet, hook)
-    assert device_of(pipe) is None and pipe._execution_device == stock(pipe) == torch.device("meta")
+    assert Layers.of(pipe).device is None and pipe._execution_device == stock(pipe) == torch.device("meta")
     remove_hook_from_module(pipe.unet)
-    assert device_of(pipe) == torch.device("cpu")
+    assert Layers.of(pipe).device == torch.device("cpu")
     pipe.vae.to("meta")
-    assert device_of(pipe) is None and pipe._execution_device == stock(pipe)
+    assert Layers.of(pipe).device is None and pipe._execution_device == stock(pipe)
