@@ -66,9 +66,8 @@ class Beside(Generic[T]):
     A guided call on CUDA makes its evidence like this, beside the network's first steps, which are not
     guided; in it the features of the pose check, which keep the CPU busy while the GPU matches; and after it
     the rest of the check and the matches of rows, which only the result asks for, and what the verdict asks
-    of them. The thread has the caller's
-    context variables and takes no gradients. On other devices both would compete for the same cores, so the
-    function is called at once.
+    of them. The thread has the caller's context variables and takes no gradients. On other devices both would
+    compete for the same cores, so the function is called at once.
 
     Args:
         function: what is worked out.

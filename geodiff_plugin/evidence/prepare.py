@@ -23,7 +23,7 @@ from geodiff_plugin.matching.matches import read_above
 from geodiff_plugin.matching.rows import RowMatches, RowPictures, match_rows, rectified_pictures
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.pose.refine import measure_fit, refine_views, unchecked
+from geodiff_plugin.pose.refine import PoseFit, measure_fit, refine_views, unchecked
 from geodiff_plugin.scale.points import RELIABLE, reliable_matches
 from geodiff_plugin.types import PosedViews
 
@@ -34,8 +34,12 @@ def cleaned(images: Sequence[Tensor], config: GuidanceConfig) -> Sequence[Tensor
 
 
 def _with_clean_images(posed: PosedViews, config: GuidanceConfig) -> PosedViews:
-    left_01, *images = cleaned([posed.left_01, *(view.image_01 for view in posed.views)], config)
-    views = (view._replace(image_01=image) for view, image in zip(posed.views, images, strict=True))
+    """The views with clean photographs; the same record if all of them were clean."""
+    images = [posed.left_01, *(view.image_01 for view in posed.views)]
+    left_01, *rights = clear = cleaned(images, config)
+    if all(one is other for one, other in zip(images, clear, strict=True)):
+        return posed
+    views = (view._replace(image_01=image) for view, image in zip(posed.views, rights, strict=True))
     return posed._replace(left_01=left_01, views=tuple(views))
 
 
@@ -49,25 +53,37 @@ def make_evidence(
     posed, points = given.beside(left_01), given.points_on(left_01.device)
     if not posed.views:
         return prepare_evidence(posed, points, config)
-    posed = _with_clean_images(posed, config)
     if config.pose == "given":
+        posed = _with_clean_images(posed, config)
         report = Beside.known(unchecked(posed.views))
         return replace(prepare_evidence(posed, points, config), report=report)
-    measured = Beside(lambda: measure_fit(posed), left_01.device)
-    evidence = None
+    (clear, measured), evidence = _measured_beside(posed, config), None
     if leaves_cpu_free(left_01.device):
         # Matching features keeps the CPU busy; meanwhile the device matches the views as given, as most fit.
         with suppress(InputError):  # raised again below, unless a refined pose mends it
-            evidence = prepare_evidence(posed, points, config)
-    fit, views = measured.result(), posed.views
+            evidence = prepare_evidence(clear, points, config)
+    fit, views = measured.result(), clear.views
     if fit.fits:  # what else there is to find changes no view, and act 3 is the first to ask
-        report = Beside(lambda: refine_views(posed, fit).report, left_01.device)
+        report = Beside(lambda: refine_views(clear, fit).report, left_01.device)
     else:
-        views, found = refine_views(posed, fit, measured_baseline)
+        views, found = refine_views(clear, fit, measured_baseline)
         report = Beside.known(found)
-    if evidence is None or any(one is not other for one, other in zip(views, posed.views, strict=True)):
-        evidence = prepare_evidence(posed._replace(views=views), points, config)
+    if evidence is None or any(one is not other for one, other in zip(views, clear.views, strict=True)):
+        evidence = prepare_evidence(clear._replace(views=views), points, config)
     return replace(evidence, report=report)
+
+
+def _measured_beside(posed: PosedViews, config: GuidanceConfig) -> tuple[PosedViews, Beside[PoseFit]]:
+    """The views with clean photographs, and how their poses fit.
+
+    Features are matched at once where the CPU has nothing else to do, and again if there were flaws.
+    """
+    device = posed.left_01.device
+    early = Beside(lambda: measure_fit(posed), device) if leaves_cpu_free(device) else None
+    clear = _with_clean_images(posed, config)
+    if early is not None and clear is posed:
+        return clear, early
+    return clear, Beside(lambda: measure_fit(clear), device)
 
 
 def prepare_evidence(native: PosedViews, points: Tensor | None, config: GuidanceConfig) -> Evidence:

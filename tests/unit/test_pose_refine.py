@@ -481,18 +481,29 @@ def test_everything_downstream_sees_the_refined_pose(pair) -> None:
     assert np.allclose(np.linalg.inv(given.native.views[0][2].numpy()), wrong, atol=1e-5)
 
 
-@pytest.mark.parametrize(("turn_deg", "status"), [(0.0, "fits"), (0.8, "refined")])
-def test_evidence_made_beside_the_check_of_the_poses_is_the_same(pair, monkeypatch, turn_deg, status) -> None:
-    """As on CUDA: the views are matched as given meanwhile, and again if a pose is refined."""
+@pytest.mark.parametrize(
+    ("turn_deg", "noise", "status"), [(0.0, 0.0, "fits"), (0.8, 0.0, "refined"), (0.0, 0.012, "refined")]
+)
+def test_evidence_made_beside_the_check_of_the_poses_is_the_same(
+    pair, monkeypatch, turn_deg, noise, status
+) -> None:
+    """As on CUDA: features are matched before it is known whether the photographs are clean, and again if
+    not; the views are matched as given meanwhile, and again if a pose is refined."""
     E = pair.E.numpy() @ pose((turn_deg, -turn_deg, 0), (0, 0, 0))
-    guidance = GeometryGuidance(pair.right.image_01, (pair.K_left.numpy(), pair.K_right.numpy()), E)
-    left = pair.left.image_01.float()[None]
-    (alone,) = guidance.prepare(left)
+    generator = torch.Generator().manual_seed(0)
+    left, right = (
+        (image + noise * torch.randn(image.shape, generator=generator)).clamp(0.0, 1.0)
+        for image in (pair.left.image_01.float(), pair.right.image_01.float())
+    )
+    guidance = GeometryGuidance(right, (pair.K_left.numpy(), pair.K_right.numpy()), E)
+    (alone,) = guidance.prepare(left[None])
+    assert torch.equal(alone.native.left_01, left) == (noise == 0.0)
     for module in ("_threads", "evidence.prepare"):
         monkeypatch.setattr(f"geodiff_plugin.{module}.leaves_cpu_free", lambda device: True)
-    (beside,) = guidance.prepare(left)
+    (beside,) = guidance.prepare(left[None])
     reports = [each.report.result() for each in (alone, beside)]
     assert all(report.status == status for report in reports)
+    assert reports[0].residual_px == reports[1].residual_px
     assert reports[0].warnings == reports[1].warnings and alone.noticed == beside.noticed
     assert torch.equal(alone.matches.inverse_depth, beside.matches.inverse_depth)
     assert torch.equal(alone.volume.levels, beside.volume.levels)
