@@ -482,7 +482,7 @@ def test_everything_downstream_sees_the_refined_pose(pair) -> None:
 
 
 @pytest.mark.parametrize(
-    ("turn_deg", "noise", "status"), [(0.0, 0.0, "fits"), (0.8, 0.0, "refined"), (0.0, 0.012, "refined")]
+    ("turn_deg", "noise", "status"), [(0.0, 0.0, "fits"), (0.8, 0.0, "refined"), (0.0, 0.012, "kept")]
 )
 def test_evidence_made_beside_the_check_of_the_poses_is_the_same(
     pair, monkeypatch, turn_deg, noise, status
