@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from geodiff_plugin._checks import InputError, InputFileError, bad_value, check_number, check_positive
 from geodiff_plugin._strips import row_strips
@@ -41,11 +41,8 @@ CELL_WIDTH = 480
 #: The colours of the photometric error end at its 98 % quantile, and not below this.
 LEAST_ERROR = 0.05
 VIDEO_SUFFIXES = (".mp4", ".webp", ".gif")
-#: A power of two: figures in inches are whole pixels again.
-DPI = 128
-POINTS_PER_PIXEL = 72 / DPI
-#: Legends and headings that are kept: those of a pair and of its overview, with room for what varies.
-MOST_DRAWN = 12
+#: Of legends and titles; it has the letters of most alphabets.
+FONT = "DejaVuSans.ttf"
 
 
 def _as_map(values: Any) -> np.ndarray:
@@ -131,20 +128,12 @@ def colour_share(values: np.ndarray, top: float = 1.0) -> np.ndarray:
     return _coloured(values, np.isfinite(values), lambda v: v / top, SHARE_COLOURS)
 
 
-def rasterised(figure: Any) -> Image.Image:
-    """The pixels of a matplotlib figure, drawn without any global state."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+@functools.lru_cache
+def _font(letters: float) -> ImageFont.FreeTypeFont:
+    """The font that comes with matplotlib, letters of so many pixels."""
+    import matplotlib
 
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
-
-
-def _sheet(width: int, height: int) -> Any:
-    """A white matplotlib figure of so many pixels, for what stands beside pictures."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
+    return ImageFont.truetype(os.path.join(matplotlib.get_data_path(), "fonts", "ttf", FONT), letters)
 
 
 @dataclass(frozen=True)
@@ -168,29 +157,25 @@ class _Legend:
     unknown: bool
 
 
-@functools.lru_cache(MOST_DRAWN)
 def _drawn(legend: _Legend) -> np.ndarray:
-    """``(H, W, 3)`` uint8 of a legend; many maps have the same one, and matplotlib takes long to draw it."""
-    high, size = legend.height, legend.letters
-    gap, bar = size // 2, max(14, high // 24)
-    wide, letters = gap + bar + 5 * size, {"fontsize": size * POINTS_PER_PIXEL}
-    x, thick = gap / wide, bar / wide
-
-    figure, low = _sheet(wide, high), size * (3 if legend.unknown else 1)
-    axes = figure.add_axes((x, low / high, thick, (high - 2 * size - low) / high))
-    ramp = np.linspace(0, 1, 512)[:, None]
-    axes.imshow(ramp, cmap=legend.colours, aspect="auto", origin="lower", extent=(0, 1, 0, 1))
-    axes.set_xticks([])
-    axes.yaxis.tick_right()
-    shares, texts = zip(*legend.marks, strict=True) if legend.marks else ((), ())
-    axes.set_yticks(shares, texts, **letters)
-    axes.tick_params(length=size * POINTS_PER_PIXEL / 3, pad=size * POINTS_PER_PIXEL / 4)
-    figure.text(x, 1 - 0.9 * size / high, legend.label, va="center", **letters)
+    """``(H, W, 3)`` uint8 of a legend."""
+    high, size, font = legend.height, legend.letters, _font(legend.letters)
+    left, right = size // 2, size // 2 + max(14, high // 24)
+    top, bottom, line = 2 * size, high - size * (3 if legend.unknown else 1), max(1, size // 12)
+    sheet = Image.new("RGB", (right + 5 * size, high), "white")
+    drawn = ImageDraw.Draw(sheet)
+    ramp = Image.fromarray(_table(legend.colours)[SHADES - 1 :: -1, None])
+    sheet.paste(ramp.resize((right - left, bottom - top), Image.Resampling.NEAREST), (left, top))
+    drawn.rectangle((left, top, right - 1, bottom - 1), outline="black", width=line)
+    for share, text in legend.marks:
+        y = bottom - share * (bottom - top)
+        drawn.line((right, y, right + size // 3, y), "black", line)
+        drawn.text((right + 7 * size // 12, y), text, "black", font, anchor="lm")
+    drawn.text((left, 0.9 * size), legend.label, "black", font, anchor="lm")
     if legend.unknown:
-        key = figure.add_axes((x, size / high, thick, size / high), facecolor=str(GREY / 255))
-        key.set(xticks=[], yticks=[])
-        figure.text(x + thick + size / 2 / wide, 1.5 * size / high, "none", va="center", **letters)
-    return np.asarray(rasterised(figure))
+        drawn.rectangle((left, high - 2 * size, right - 1, high - size - 1), (GREY,) * 3, "black", line)
+        drawn.text((right + size // 2, high - 1.5 * size), "none", "black", font, anchor="lm")
+    return np.asarray(sheet)
 
 
 def _figure(
@@ -235,15 +220,15 @@ def as_picture(image: Any) -> Image.Image:
     return Image.fromarray(values).convert("RGB")
 
 
-@functools.lru_cache(MOST_DRAWN)
-def _heading(titles: tuple[str, ...], width: int, height: int, cell_width: int, gap: int) -> np.ndarray:
-    """``(height, width, 3)`` uint8, titles above the cells of a row; too long ones in smaller letters."""
-    figure = _sheet(width, height)
+def _heading(titles: Sequence[str], width: int, height: int, cell_width: int, gap: int) -> Image.Image:
+    """Titles above the cells of a row; too long ones in smaller letters."""
+    sheet = Image.new("RGB", (width, height), "white")
+    drawn = ImageDraw.Draw(sheet)
     for k, title in enumerate(titles):
-        size = min(15, 1.7 * cell_width / max(1, len(title))) * POINTS_PER_PIXEL
-        x = (gap + k * (cell_width + gap) + cell_width / 2) / width
-        figure.text(x, 0.5, title, fontsize=size, parse_math=False, ha="center", va="center")
-    return np.asarray(rasterised(figure))
+        font = _font(min(15, 1.7 * cell_width / max(1, len(title))))
+        centre = gap + k * (cell_width + gap) + cell_width / 2, height / 2
+        drawn.text(centre, title, "black", font, anchor="mm")
+    return sheet
 
 
 def grid(
@@ -263,10 +248,10 @@ def grid(
     wide, top = gap + columns * (cell_width + gap), gap
     sheet, named = Image.new("RGB", (wide, gap + sum(heights)), "white"), iter(titles)
     for row, height in zip(rows, heights, strict=True):
-        names = tuple(itertools.islice(named, len(row)))
+        names = list(itertools.islice(named, len(row)))
         for k, cell in enumerate(row):
             sheet.paste(cell, (gap + k * (cell_width + gap), top + head))
-        sheet.paste(Image.fromarray(_heading(names, wide, head, cell_width, gap)), (0, top))
+        sheet.paste(_heading(names, wide, head, cell_width, gap), (0, top))
         top += height
     return sheet
 

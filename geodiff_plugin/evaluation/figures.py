@@ -14,8 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import check_choice
@@ -31,7 +33,7 @@ from geodiff_plugin.formats import as_image_01, atomic_path
 from geodiff_plugin.formats.out import write_text
 from geodiff_plugin.geometry import warp_right_to_left
 from geodiff_plugin.jobs.journal import Record
-from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, grid, rasterised, ticks
+from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, grid, ticks
 from geodiff_plugin.scale.space import SPACES, smooth_floor
 from geodiff_plugin.types import DepthFrame
 
@@ -53,9 +55,16 @@ def _new_figure(width_in: float, height_in: float) -> Any:
     return Figure(figsize=(width_in, height_in), dpi=90, layout="constrained")
 
 
+def _rasterised(figure: Figure) -> Image.Image:
+    """The pixels of a figure, drawn without any global state."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+
+
 def _save_png(picture: Any, path: Path) -> None:
     """Write a picture whole or not at all."""
-    image = rasterised(picture) if isinstance(picture, Figure) else picture
+    image = _rasterised(picture) if isinstance(picture, Figure) else picture
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
         image.save(temporary, format="PNG", optimize=True)
