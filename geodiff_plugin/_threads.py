@@ -77,7 +77,7 @@ class Beside(Generic[T]):
     """
 
     def __init__(self, function: Callable[[], T], device: torch.device, *, own_stream: bool = False) -> None:
-        self._pool, self._stream = None, None
+        self._stream = None
         if not leaves_cpu_free(device):
             self._answer = Future[T]()
             self._answer.set_result(function())
@@ -94,9 +94,9 @@ class Beside(Generic[T]):
                     ready.wait()
                 return context.run(function)
 
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="geodiff-evidence")
-        self._answer = self._pool.submit(work)
-        self._pool.shutdown(wait=False)  # the thread ends with its work, even if nobody asks for the answer
+        pool = ThreadPoolExecutor(1, thread_name_prefix="geodiff-evidence")
+        self._answer = pool.submit(work)
+        pool.shutdown(wait=False)  # the thread ends with its work, even if nobody asks for the answer
 
     @classmethod
     def known(cls, answer: T) -> Beside[T]:
@@ -117,10 +117,8 @@ class Beside(Generic[T]):
         return answer
 
     def close(self) -> None:
-        """Wait until its thread and those that its answer holds have ended, whether anybody asked or not."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
-        if not self._answer.cancelled() and self._answer.exception() is None:
+        """Wait until its work and that which its answer holds have ended, whether anybody asked or not."""
+        if self._answer.exception() is None:
             for part in _parts_of(self._answer.result()):
                 if isinstance(part, Beside):
                     part.close()

@@ -832,7 +832,7 @@ MUTANTS = [
         ("tensor.record_stream(stream)", "pass"),
         ("return context.run(function)", "return function()"),
         ("with torch.no_grad(), torch.cuda", "with torch.cuda"),
-        ("shutdown(wait=True, cancel", "shutdown(wait=False, cancel"),
+        ("if self._answer.exception() is None", "if self._answer.done()"),
         ("        arrived.synchronize()", "        pass"),
         ("                    part.close()", "                    pass"),
         ("self._stream.record_event(), _stream_beside(device)", "None, _stream_beside(device)"),
