@@ -685,7 +685,7 @@ MUTANTS = [
     ),
     *of(
         "pose/tearing.py",
-        ("np.abs(below - beside[::-1])", "np.abs(below - beside)"),
+        ("np.ascontiguousarray(beside[::-1])", "np.ascontiguousarray(beside)"),
         ("heights[view] / len(greys[view])", "heights[0] / len(greys[0])"),
         ("if len(torn) != 1 or any", "if len(torn) == 0 or any"),
         tests=(f"{UNIT}tearing.py",),
@@ -706,13 +706,13 @@ MUTANTS = [
     ),
     *of(
         "pose/bars.py",
-        ("[_bar(lines), _bar(lines[::-1])]", "[_bar(lines), _bar(lines)]"),
+        ("least[::-1], most[::-1]", "least, most"),
         ("grey if turned else grey.T", "grey.T if turned else grey.T"),
         tests=(f"{UNIT}bars.py",),
     ),
     *of(
         "pose/moving.py",
-        ("apart < TOGETHER * abs(middle)", "apart < 10.0 * abs(middle)"),
+        ("apart < TOGETHER * np.abs(middle)", "apart < 10.0 * np.abs(middle)"),
         ("moved / compared if", "moved / len(off_px) ** 2 if"),
         tests=(f"{UNIT}pose_refine.py",),
     ),

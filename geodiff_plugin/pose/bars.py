@@ -16,11 +16,13 @@ WIDEST = 0.45
 AS_WIDE = 0.005
 
 
-def _bar(lines: np.ndarray) -> float:
-    """Share of the lines ``(N, L)``, from the first on, that have the first one's value all along."""
-    value = int(lines[0, 0])
-    even = (np.abs(lines.astype(np.int16) - value) <= EVEN).all(1)
-    return float(np.argmin(even)) / len(lines) if not even.all() else 1.0
+def _bar(value: int, least: np.ndarray, most: np.ndarray) -> float:
+    """Share of the lines, from the first on, that have a value all along.
+
+    ``least`` and ``most (N,)`` are the extremes of every line.
+    """
+    even = (most.astype(np.int16) - value <= EVEN) & (value - least.astype(np.int16) <= EVEN)
+    return float(np.argmin(even)) / len(even) if not even.all() else 1.0
 
 
 def bar_share(greys: Sequence[np.ndarray]) -> float:
@@ -33,7 +35,9 @@ def bar_share(greys: Sequence[np.ndarray]) -> float:
         shares = []
         for grey in greys:
             lines = grey if turned else grey.T
-            shares += [_bar(lines), _bar(lines[::-1])]
+            least, most = lines.min(1), lines.max(1)
+            shares.append(_bar(int(lines[0, 0]), least, most))
+            shares.append(_bar(int(lines[-1, 0]), least[::-1], most[::-1]))
         if NARROWEST <= min(shares) <= max(shares) <= min(WIDEST, min(shares) + AS_WIDE):
             return max(shares)
     return 0.0

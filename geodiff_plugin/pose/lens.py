@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -23,6 +21,8 @@ STEP_K1 = 0.01
 STEP_TURN = 1e-4
 #: No lens of a camera with a rectilinear picture has more.
 MOST_K1 = 0.6
+#: Steps to the rays without a distortion, as many as OpenCV takes.
+STEPS_OF_RAYS = 5
 
 
 class _Pair(NamedTuple):
@@ -31,7 +31,7 @@ class _Pair(NamedTuple):
     The true left ray ``x`` and right ray ``y`` meet where ``y . m = 0`` with ``m = R x x t``.
     """
 
-    bent: np.ndarray  # (2 N, 1, 2) the left rays, then the right ones
+    bent: np.ndarray  # (2, 2 N) x and y of the left rays, then of the right ones
     lines: np.ndarray  # (5, 3) times x: m, then the normal of the line in pixels
 
 
@@ -40,14 +40,30 @@ def _pair(tracks: Tracks, T: np.ndarray) -> _Pair:
     tx, ty, tz = T[:3, 3]
     m = np.array([[0.0, tz, -ty], [-tz, 0.0, tx], [ty, -tx, 0.0]]) @ T[:3, :3]
     normals = np.linalg.inv(tracks.K_rights[0])[:, :2].T @ m
-    return _Pair(np.concatenate([tracks.rays, right])[:, None, :2], np.concatenate([m, normals]))
+    bent = np.concatenate([tracks.rays, right])[:, :2].T
+    return _Pair(np.ascontiguousarray(bent), np.concatenate([m, normals]))
 
 
-def _residuals(pair: _Pair, k1s: Sequence[float]) -> np.ndarray:
+def undistorted_rays(bent: np.ndarray, k1s: np.ndarray) -> np.ndarray:
+    """Rays ``(M, N, 2)`` without the radial distortions ``k1s (M,)``, of bent ones ``(2, N)``, x and y.
+
+    They are the fixed points of ``x = bent / (1 + k1 |x|^2)``, sought as ``cv2.undistortPoints`` does, which
+    takes several times as long, because it evaluates all 14 coefficients of its model for one ray after the
+    other. A ray that a step would mirror stays as it is.
+    """
+    k1, (x, y) = k1s[:, None], bent
+    mirrored = np.zeros((len(k1s), bent.shape[1]), bool)
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # only mirrored rays get that far
+        for _ in range(STEPS_OF_RAYS):
+            factor = 1.0 / (1.0 + k1 * (x * x + y * y))
+            mirrored |= factor < 0.0
+            x, y = bent[0] * factor, bent[1] * factor
+    return np.stack([np.where(mirrored, bent[0], x), np.where(mirrored, bent[1], y)], axis=-1)
+
+
+def _residuals(pair: _Pair, k1s: np.ndarray) -> np.ndarray:
     """Signed distances ``(len(k1s), N)`` from the epipolar lines without these distortions, pixels."""
-    K = np.eye(3)
-    straight = np.stack([cv2.undistortPoints(pair.bent, K, np.array([k1, 0, 0, 0])) for k1 in k1s])
-    left, right = np.split(straight[:, :, 0], 2, axis=1)
+    left, right = np.split(undistorted_rays(pair.bent, k1s), 2, axis=1)
     of_left = left @ pair.lines[:, :2].T + pair.lines[:, 2]  # (len(k1s), N, 5)
     off = (of_left[..., :2] * right).sum(-1) + of_left[..., 2]
     return off / np.maximum(np.hypot(of_left[..., 3], of_left[..., 4]), TINY)
@@ -103,7 +119,7 @@ def _certain_k1(tracks: Tracks, T: np.ndarray, explained: np.ndarray) -> float:
     # Derivatives of the residuals by k1, by the shift and by the others.
     A = np.concatenate([np.ones((len(tracks), 2)), explained], axis=1)
     for _ in range(STEPS):
-        off, ahead, behind = _residuals(pair, (k1, k1 + STEP_K1, k1 - STEP_K1))
+        off, ahead, behind = _residuals(pair, np.array([k1, k1 + STEP_K1, k1 - STEP_K1]))
         A[:, 0] = (ahead - behind) / (2 * STEP_K1)
         centred = off - explained @ others
         centred = centred - np.median(centred)

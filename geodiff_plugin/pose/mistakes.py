@@ -79,11 +79,22 @@ class _Candidate(NamedTuple):
 
 
 def _fit(tracks: Tracks, T: np.ndarray) -> _Fit:
-    at = epipolar(tracks, T)
-    ahead = (at.inverse_depth > 0) & ((tracks.rays @ T[2, :3] + at.inverse_depth * T[2, 3]) > 0)
-    off_px = np.abs(at.off_px)
+    ahead, off_px = _ahead(tracks, T)
     shares = tuple(float((ahead & (off_px < near_px)).mean()) for near_px in _NEAR_PX)
     return _Fit(shares, float(np.median(off_px)))
+
+
+def _ahead(tracks: Tracks, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which matches ``(N,)`` lie in front of both cameras, and how far from their lines, pixels."""
+    at = epipolar(tracks, T)
+    ahead = (at.inverse_depth > 0) & ((tracks.rays @ T[2, :3] + at.inverse_depth * T[2, 3]) > 0)
+    return ahead, np.abs(at.off_px)
+
+
+def _fine_share(tracks: Tracks, T: np.ndarray) -> float:
+    """The last of the shares of ``_fit``."""
+    ahead, off_px = _ahead(tracks, T)
+    return float((ahead & (off_px < _NEAR_PX[-1])).mean())
 
 
 def _scaled_K(factor: float) -> Message:
@@ -182,14 +193,13 @@ def exchangeable(
     epipolar lines. ``sizes`` are ``(H, W)`` of the left image and of the right ones that the tracks are of.
     """
     shares = []
-    for v, poses in enumerate(zip(given, near, strict=True)):
+    tried = (near,) if near is given else (given, near)  # one, where the poses fit as given
+    for v, poses in enumerate(zip(*tried, strict=True)):
         seen = tracks.view(v)
         if len(seen) < FEWEST:
             continue
-        undone = max(
-            _fit(each, T).shares[-1] for each in _exchanged(seen, sizes[0], sizes[v + 1]) for T in poses
-        )
-        as_it_is = _fit(seen, near[v]).shares[-1]
+        undone = max(_fine_share(each, T) for each in _exchanged(seen, sizes[0], sizes[v + 1]) for T in poses)
+        as_it_is = _fine_share(seen, near[v])
         shares.append(min(1.0, undone / as_it_is) if as_it_is > 0 else 1.0)
     return min(shares, default=math.nan)
 

@@ -30,14 +30,18 @@ def moved_share(tracks: Tracks, T: np.ndarray) -> float:
     usual_px = float(np.median(np.abs(off_px))) if len(off_px) else math.nan
     kept = np.abs(off_px) < MOST_OFF_PX
     off_px, block = off_px[kept], blocks(tracks.kept(kept))
-    moved, compared = 0, 0
-    for each in range(int(block.max(initial=-1)) + 1):
-        of_block = off_px[block == each]
-        if len(of_block) < FEWEST_OF_BLOCK:
-            continue
-        compared += len(of_block)
-        middle = float(np.median(of_block))
-        apart = float(np.median(np.abs(of_block - middle)))
-        if abs(middle) > max(LEAST_OFF_PX, LEAST_TIMES * usual_px) and apart < TOGETHER * abs(middle):
-            moved += len(of_block)
+    count = np.bincount(block)
+    middle = _medians(off_px, block, count)
+    apart = _medians(np.abs(off_px - middle[block]), block, count)
+    enough = count >= FEWEST_OF_BLOCK
+    away = np.abs(middle) > max(LEAST_OFF_PX, LEAST_TIMES * usual_px)
+    moved = int(count[enough & away & (apart < TOGETHER * np.abs(middle))].sum())
+    compared = int(count[enough].sum())
     return moved / compared if compared >= FEWEST else math.nan
+
+
+def _medians(values: np.ndarray, block: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """The median of the values ``(N,)`` of every block, which ``count`` of them lie in, none of it empty."""
+    in_order = values[np.lexsort((values, block))]
+    first = np.cumsum(count) - count
+    return (in_order[first + (count - 1) // 2] + in_order[first + count // 2]) / 2.0

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
@@ -42,10 +43,9 @@ EDGE = 4
 
 def _tears(grey: np.ndarray) -> list[tuple[float, int, int]]:
     """Gain, row and shift of every tear of a grey image ``(H, W)`` uint8, the clearest first."""
-    image = grey.astype(np.float32)
-    rows = np.abs(np.diff(image, axis=0)).mean(1)  # (H - 1,) between a row and the next
-    if len(rows) < 2 * EDGE + 1:
+    if len(grey) < 2 * EDGE + 2:
         return []
+    rows = _sums(cv2.absdiff(grey[1:], grey[:-1])) / np.float32(grey.shape[1])  # (H - 1,) from row to row
     near = np.pad(rows, 3, mode="edge")
     near = np.stack([near[k : k + len(rows)] for k in (0, 1, 5, 6)]).max(0)  # two and three rows away
     steep = rows / np.maximum(near, 0.5)
@@ -54,27 +54,31 @@ def _tears(grey: np.ndarray) -> list[tuple[float, int, int]]:
     for row in np.argsort(-steep)[:MOST_ROWS]:
         if steep[row] < STEEP:
             break
-        gain, shift = _shift(image[row], image[row + 1])
+        gain, shift = _shift(grey[row], grey[row + 1])
         if gain > GAIN and abs(shift) >= LEAST_SHIFT_PX:
             found.append((min(gain, float(steep[row])), int(row) + 1, shift))
     return sorted(found, reverse=True)
 
 
+def _sums(rows: np.ndarray) -> np.ndarray:
+    """The sum ``(N,)`` of every row ``(N, W)`` uint8, float32, which is exact for up to 65,793 columns."""
+    return cv2.reduce(rows, 1, cv2.REDUCE_SUM, dtype=cv2.CV_32F)[:, 0]
+
+
 def _shift(above: np.ndarray, below: np.ndarray) -> tuple[float, int]:
     """By how many pixels a row ``(W,)`` has moved against that above it, and how many times as alike it is.
 
-    The gain is 0 where parts of the row do not agree, or the largest shift is the best one.
+    Both are uint8. The gain is 0 where parts of the row do not agree, or the largest shift is the best one.
     """
     width = len(above)
     most = int(MOST_SHIFT * width)
     part = np.arange(width) * PARTS // width
-    unmoved = np.bincount(part, np.abs(above - below), PARTS) / np.bincount(part, minlength=PARTS)
-    # Row k: what lies ``most - k`` pixels to the right of every pixel above; NaN beyond the ends.
-    beside = sliding_window_view(np.pad(above, most, constant_values=np.nan), width)
-    off = np.abs(below - beside[::-1])  # (2 most + 1, W), of every shift from -most to most
-    known = ~np.isnan(off)
-    off[~known] = 0.0
-    totals = off.sum(1) / known.sum(1)
+    # Row k: what lies ``most - k`` pixels to the right of every pixel above, and 1 where the picture has it.
+    beside, known = (sliding_window_view(np.pad(row, most), width) for row in (above, np.ones_like(above)))
+    beside, known = np.ascontiguousarray(beside[::-1]), known[::-1]
+    off = known * cv2.absdiff(np.tile(below, (len(beside), 1)), beside)  # of every shift from -most to most
+    totals = _sums(off) / known.sum(1)
+    unmoved = np.bincount(part, off[most], PARTS) / np.bincount(part, minlength=PARTS)
     best = int(np.argmin(totals))
     count = np.maximum(np.bincount(part, known[best], PARTS), 1.0)
     of_parts = np.bincount(part, off[best], PARTS) / count

@@ -17,7 +17,7 @@ from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.matching.planes import Parallax
 from geodiff_plugin.pose import refine
 from geodiff_plugin.pose import tracks as tracks_module
-from geodiff_plugin.pose.lens import remaining_distortion
+from geodiff_plugin.pose.lens import remaining_distortion, undistorted_rays
 from geodiff_plugin.pose.mistakes import _candidates, exchangeable, find_mistake
 from geodiff_plugin.pose.moving import moved_share
 from geodiff_plugin.pose.refine import depths_apart, fit_displacement, straightened
@@ -27,10 +27,12 @@ from geodiff_plugin.pose.tracks import (
     _dense_matches,
     behind_infinity,
     epipolar,
+    grey_image,
     median_residuals,
     project_tracks,
     residuals_px,
     solve_inverse_depth,
+    sparse_tracks,
 )
 from geodiff_plugin.result.indicators import indicators_of
 from geodiff_plugin.types import CameraView, PosedViews
@@ -350,6 +352,41 @@ def test_distortion_of_both_pictures_is_measured(k1: float, E: np.ndarray) -> No
     assert found == pytest.approx(k1, abs=0.03) and abs(found) <= abs(k1) + 0.005
     assert alone == pytest.approx(k1, abs=0.06) and abs(alone) <= abs(found)
     assert np.isnan(remaining_distortion(bent.kept(slice(39)), Ts[0])).all()
+
+
+def test_rays_without_a_distortion_are_those_of_opencv() -> None:
+    """Also rays so far out that the model folds there, which OpenCV leaves as they are."""
+    bent = np.random.default_rng(0).normal(0.0, 0.9, (2, 500))
+    k1s = np.array([-0.6, -0.2, 0.0, 0.3])
+    theirs = [cv2.undistortPoints(bent.T[:, None], np.eye(3), np.array([k1, 0, 0, 0])) for k1 in k1s]
+    np.testing.assert_allclose(undistorted_rays(bent, k1s), np.stack(theirs)[:, :, 0], rtol=1e-9)
+    assert (undistorted_rays(bent, k1s)[0] == bent.T).all(1).any()
+
+
+def test_a_grey_picture_is_the_same_in_any_layout_and_rounded_to_the_nearest_level() -> None:
+    planes = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(0))
+    luma = np.array([0.299, 0.587, 0.114]) @ planes.double().numpy().reshape(3, -1)
+    interleaved = planes.permute(1, 2, 0).contiguous().permute(2, 0, 1)
+    strided = torch.stack([planes, planes], dim=-1)[..., 0]
+    for image in (planes, interleaved, strided):
+        grey, _ = grey_image(image, torch.eye(3), 1.0)
+        assert grey.dtype == np.uint8
+        assert np.abs(grey - 255.0 * luma.reshape(40, 60)).max() < 0.5 + 1e-3
+    alone, _ = grey_image(strided[:1], torch.eye(3), 1.0)
+    np.testing.assert_array_equal(alone, np.rint(255.0 * planes[0].numpy()))
+
+
+def test_the_threads_for_features_stay_for_the_next_pictures() -> None:
+    rng = np.random.default_rng(0)
+    views = [(rng.integers(0, 256, (60, 80), dtype=np.uint8), np.eye(3)) for _ in range(2)]
+
+    def threads() -> set[threading.Thread]:
+        return {each for each in threading.enumerate() if each.name.startswith("geodiff-features")}
+
+    sparse_tracks(views)
+    before = threads()
+    sparse_tracks(views)
+    assert before and before <= threads() and len(threads()) <= 4
 
 
 @pytest.mark.parametrize("E", [RIG, TRUE], ids=["rig", "posed"])
