@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # what is wrong with a file is said before numpy is imported
     from PIL import Image
 
 PathLike = str | os.PathLike[str]
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 #: EXIF's tag of how an image is turned or mirrored; from 5 on its sides change places.
 ORIENTATION = 0x0112
 #: Its value for an image that is shown as it is stored.
@@ -129,18 +130,47 @@ def stored_size(path: PathLike, name: str) -> tuple[int, int]:
         return image.size
 
 
+def exif_of(image: Image.Image) -> Image.Exif:
+    """The EXIF data of an opened image, of which no more than needed is decoded.
+
+    Pillow decodes a PNG for them, because they may lie behind its pixels.
+    """
+    from PIL import Image
+
+    file = getattr(image, "fp", None)
+    if image.format == "PNG" and file is not None and _ends_with_pixels(file):
+        return Image.Image.getexif(image)
+    return image.getexif()
+
+
+def _ends_with_pixels(file: IO[bytes]) -> bool:
+    """Whether a whole PNG file has nothing behind its pixels."""
+    here, kinds = file.tell(), list[bytes]()
+    try:
+        file.seek(len(PNG_SIGNATURE))
+        while kinds[-1:] != [b"IEND"]:
+            head = file.read(8)
+            if len(head) < 8:
+                return False
+            kinds.append(head[4:])
+            file.seek(int.from_bytes(head[:4], "big") + 4, os.SEEK_CUR)  # its content and its checksum
+    finally:
+        file.seek(here)
+    return kinds[-2:-1] == [b"IDAT"]
+
+
 def upright_size(path: PathLike, name: str) -> tuple[int, int]:
     """``(width, height)`` of an image file as it is shown, turned by its EXIF orientation."""
     with open_image(path, name) as image:
         width, height = image.size
-        turned = image.getexif().get(ORIENTATION, 1) >= 5
+        turned = exif_of(image).get(ORIENTATION, 1) >= 5
     return (height, width) if turned else (width, height)
 
 
 def is_turned(path: PathLike) -> bool:
     """Whether an image file is shown turned or mirrored, by its EXIF orientation."""
     with open_image(path, "the image") as image:
-        return image.getexif().get(ORIENTATION) in TURNS
+        return exif_of(image).get(ORIENTATION) in TURNS
 
 
 def read_text(path: PathLike, name: str, what: str = "a text file") -> str:

@@ -13,7 +13,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from geodiff_plugin._checks import InputError, bad_type, bad_value, check_number, warn
-from geodiff_plugin.formats.files import ORIENTATION, TURNS, UPRIGHT, PathLike, open_image
+from geodiff_plugin.formats.files import ORIENTATION, TURNS, UPRIGHT, PathLike, exif_of, open_image
 from geodiff_plugin.formats.rigs import intrinsics
 from geodiff_plugin.messages import Message
 
@@ -255,9 +255,9 @@ def intrinsics_from_exif(
     if not isinstance(source, Image.Image):
         with open_image(source, name) as image:
             K, notes = intrinsics_from_exif(image, name)
-            turned = image.getexif().get(ORIENTATION, 1) >= 5 and not as_stored
+            turned = exif_of(image).get(ORIENTATION, 1) >= 5 and not as_stored
         return intrinsics(K[1, 1], K[0, 0], K[1, 2], K[0, 2]) if turned else K, notes
-    number = partial(_exif_number, source.getexif().get_ifd(IFD.Exif))
+    number = partial(_exif_number, exif_of(source).get_ifd(IFD.Exif))
     width, height = source.size
     taken = number(Base.ExifImageWidth), number(Base.ExifImageHeight)
     if all(taken):

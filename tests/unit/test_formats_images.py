@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
 
+from geodiff_plugin import InputError
 from geodiff_plugin.formats import as_image_01, picture_size, read_image
+from geodiff_plugin.formats.files import is_turned, upright_size
+from geodiff_plugin.formats.images import intrinsics_from_exif
 from geodiff_plugin.formats.lenses import (
     distortion_from_text,
     undistorted,
@@ -44,6 +48,39 @@ def heard(value) -> list[str]:
 #: Ways to mirror an image; EXIF's orientations 1 to 4 do so, 5 to 8 change rows and columns then.
 FLIPS = [X, X[:, ::-1], X[::-1, ::-1], X[::-1]]
 UPRIGHT = [*FLIPS, *(FLIPS[i].transpose(1, 0, 2) for i in (0, 3, 2, 1))]
+
+
+def _turned_png(folder, behind: bool):
+    """A PNG file of a photograph on its side, whose EXIF data lie before or behind its pixels."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif.get_ifd(0x8769)[0xA405] = 35  # the focal length in 35 mm equivalent
+    path = saved(folder, PIL, exif=exif)
+    if behind:
+        raw = path.read_bytes()
+        start, end = raw.index(b"eXIf") - 4, len(raw) - 12
+        stop = start + 12 + int.from_bytes(raw[start : start + 4], "big")
+        path.write_bytes(raw[:start] + raw[stop:end] + raw[start:stop] + raw[end:])
+    return path
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_exif_of_a_png_is_found_before_and_behind_its_pixels(tmp_path, behind):
+    path = _turned_png(tmp_path, behind)
+    assert is_turned(path) and upright_size(path, "left") == (H, W)
+    assert intrinsics_from_exif(path, "left")[0][0, 2] == (H - 1) / 2
+
+
+def test_a_png_is_not_decoded_for_its_exif_unless_it_is_cut_off(tmp_path, monkeypatch):
+    path = _turned_png(tmp_path, behind=False)
+    cut = tmp_path / "cut.png"
+    cut.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(InputError, match="does not decode"):
+        is_turned(cut)
+    monkeypatch.setattr(PngImageFile, "load", lambda _: pytest.fail("its pixels were decoded"))
+    assert is_turned(path) and upright_size(path, "left") == (H, W)
+    assert not is_turned(saved(tmp_path, PIL, "plain.png"))
+    assert intrinsics_from_exif(path, "left")[0][0, 2] == (H - 1) / 2
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
