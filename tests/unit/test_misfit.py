@@ -38,8 +38,7 @@ def view_at(*centre: float) -> CameraView:
         ({}, SIZE, (0, 0, 0)),
         # Of right pairs: matches within 0.45 px of their lines, k1 up to .08.
         ({"epipolar_px": 0.44, "behind_px": 0.0, "distortion": -0.079}, SIZE, (0, 0, 0)),
-        # Refined poses of right pairs: bent by up to 1 px, a scale known to 6 %, others 15 % apart.
-        ({"straightened_px": 0.99, "scale_spread": 0.059, "depth_spread": 0.149}, SIZE, (0, 0, 0)),
+        ({"straightened_px": 0.99}, SIZE, (0, 0, 0)),  # refined poses of right pairs are bent by up to 1 px
         ({"epipolar_px": 0.75}, SIZE, (0.6, 0, 0)),  # .75^2 = .45^2 + .6^2
         ({"behind_px": 3.0, "behind_infinity": 0.041}, SIZE, (3.0, 0, 0)),
         ({"behind_px": 3.0, "behind_infinity": 0.039}, SIZE, (0, 0, 0)),  # single matches, as on blank walls
@@ -50,15 +49,20 @@ def view_at(*centre: float) -> CameraView:
         ({"distortion": -0.25}, SIZE, (0, 0.17, 0)),
         ({"shear": -0.03}, (480, 600), (18 / 3**0.5, 0, 0)),
         ({"shear": 0.0009}, (480, 600), (0, 0, 0)),
-        ({"scale_spread": 0.1}, SIZE, (0, 0, 0.08)),
+        # A refined pose has three quarters of the stated spread of its scale, also of a usual one.
+        ({"scale_spread": 0.04}, SIZE, (0, 0, 0.03)),
+        ({"scale_spread": math.inf}, SIZE, (0, 0, math.inf)),  # no point is in front of the cameras
+        # Where another pose fits as well, it has three tenths of the change of depth between them; of a change
+        # of more than .15, what is beyond.
+        ({"depth_spread": 0.1}, SIZE, (0, 0, 0.03)),
         ({"depth_spread": 0.25}, SIZE, (0, 0, 0.2)),
-        ({"scale_spread": 0.1, "depth_spread": 0.25}, SIZE, (0, 0, math.hypot(0.08, 0.2))),
+        ({"scale_spread": 0.2, "depth_spread": 0.25}, SIZE, (0, 0, math.hypot(0.15, 0.2))),
         # Residuals are in pixels of a grid of 832 columns at most, what lies behind infinity in the image's.
         ({"epipolar_px": 0.75, "behind_px": 0.0}, (900, 1664), (1.2, 0, 0)),
         ({"behind_px": 3.0, "behind_infinity": 0.1}, (900, 1664), (3.0, 0, 0)),
     ],
 )
-def test_only_what_right_pairs_do_not_have_is_a_misfit(found, size, expected):
+def test_what_matches_show_and_those_of_right_pairs_do_not_is_a_misfit(found, size, expected):
     assert misfit_of(Indicators(**found), size) == pytest.approx(expected, abs=1e-9)
 
 
@@ -109,6 +113,17 @@ def test_confidence_keeps_the_share_of_a_normal_error_within_ten_percent():
     within = [2.0 * norm.cdf(0.1 * shift_px / px) - 1.0 for px in (math.hypot(0.25, 1.5), 0.25)]
     np.testing.assert_allclose(found, within[0] / within[1], rtol=1e-4)
     assert found.max() > 0.9 and found.min() < 0.2, "what is near loses little, what is far nearly all"
+
+
+def test_confidence_counts_an_error_that_all_depths_share():
+    """Errors of a match and of all depths together, drawn: of those within 10 % by the first, how many stay."""
+    rng = np.random.default_rng(2)
+    depth_m, spread = torch.full((1, 1, *SIZE), 12.0), 0.06
+    match = rng.normal(0.0, 0.25 / (100.0 * 0.3 / 12.0), 400_000)
+    both = match + rng.normal(0.0, spread, match.size)
+    found = share_left(depth_m, torch.from_numpy(K), [view_at(0.3, 0, 0)], Misfit(relative=spread))
+    kept = (np.abs(both) < 0.1).mean() / (np.abs(match) < 0.1).mean()
+    torch.testing.assert_close(found, torch.full_like(found, float(kept)), rtol=0.01, atol=0.0)
 
 
 def test_without_a_misfit_confidence_stays():
