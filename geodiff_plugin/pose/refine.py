@@ -58,9 +58,9 @@ _MOST_SHIFT = 0.8
 LENGTH_SPREAD = 0.15
 #: The same of the scene's median depth, measured on the same pairs.
 DEPTH_SPREAD = 0.05
-# A pose is undetermined if the one that fits best changes log depth by more than this in the median. That was
-# up to .148 for right pairs, and .17 to .64 where the yaw of E was off by a degree.
-_MOST_SPREAD = 0.16
+#: A pose is undetermined if the one that fits best changes log depth by more than this in the median. That
+#: was up to .148 for right pairs, and .17 to .64 where the yaw of E was off by a degree.
+MOST_DEPTH_SPREAD = 0.16
 # Straightening: residual above which a match counts for less, pixels.
 _BENT_PX = 0.5
 # Pull of its 20 coefficients towards 0, in matches.
@@ -401,7 +401,7 @@ def depths_apart(tracks: Tracks, Ts: np.ndarray, free: np.ndarray) -> float:
 
 def _undetermined(apart: float) -> tuple[Message, ...]:
     """A message where the matches do not determine the pose, and with it the depth."""
-    if apart <= _MOST_SPREAD:
+    if apart <= MOST_DEPTH_SPREAD:
         return ()
     sentence = (
         "The matches do not determine the pose: another one fits them as well, and its depths differ by "

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from geodiff_plugin._camera_checks import LONG_BASELINE_M
 from geodiff_plugin.messages import Message
+from geodiff_plugin.pose.refine import MOST_DEPTH_SPREAD
 from geodiff_plugin.result.indicators import POINTS_WRONG
 from geodiff_plugin.types import Indicators, Verdict
 
@@ -244,6 +245,13 @@ def _scale_uncertain(found: Indicators) -> bool:
     return found.scale_spread > MOST_SCALE_SPREAD and found.points < LEAST_POINTS
 
 
+def _pose_uncertain(found: Indicators) -> bool:
+    """Whether scale and shape are each within their limit, but together as doubtful as one beyond it."""
+    if _scale_uncertain(found) or found.depth_spread > MOST_DEPTH_SPREAD or found.points >= LEAST_POINTS:
+        return False
+    return math.hypot(found.scale_spread / MOST_SCALE_SPREAD, found.depth_spread / MOST_DEPTH_SPREAD) > 1.0
+
+
 def _why_exchanged(_: Indicators) -> str:
     return (
         "Near and far are exchanged against the prior, or the inverse pose fits better: are left and "
@@ -293,6 +301,14 @@ def _why_scale(found: Indicators) -> str:
         f"{100 * min(found.scale_spread, 1):.0f} %: the baseline and the depth of the scene under the given "
         "pose disagree. Give the measured distance of the cameras (--baseline, measured_baseline=True), or "
         f"{LEAST_POINTS} known points or more."
+    )
+
+
+def _why_pose(found: Indicators) -> str:
+    return (
+        f"The refined pose is uncertain: its scale by {100 * found.scale_spread:.0f} %, and another pose "
+        f"that fits as well changes depths by {100 * math.expm1(found.depth_spread):.0f} % in the median. "
+        "Check K, or give a more exact pose."
     )
 
 
@@ -439,6 +455,7 @@ REASONS = (
         ),
     ),
     Rule("scale.uncertain", _scale_uncertain, _why_scale),
+    Rule("pose.undetermined", _pose_uncertain, _why_pose),
     Rule(
         "depth.off-matches",
         lambda found: found.off_matches > OFF_MATCHES and found.points < LEAST_POINTS,

@@ -49,20 +49,20 @@ def view_at(*centre: float) -> CameraView:
         ({"distortion": -0.25}, SIZE, (0, 0.17, 0)),
         ({"shear": -0.03}, (480, 600), (18 / 3**0.5, 0, 0)),
         ({"shear": 0.0009}, (480, 600), (0, 0, 0)),
-        # A refined pose has three quarters of the stated spread of its scale, also of a usual one.
+        # Three quarters of the spread of a scale count, or what is beyond .06 if that is more.
         ({"scale_spread": 0.04}, SIZE, (0, 0, 0.03)),
+        ({"scale_spread": 0.1}, SIZE, (0, 0, 0.08)),
         ({"scale_spread": math.inf}, SIZE, (0, 0, math.inf)),  # no point is in front of the cameras
-        # Where another pose fits as well, it has three tenths of the change of depth between them; of a change
-        # of more than .15, what is beyond.
+        # Three tenths of the change by another pose count, or what is beyond .15 if that is more.
         ({"depth_spread": 0.1}, SIZE, (0, 0, 0.03)),
         ({"depth_spread": 0.25}, SIZE, (0, 0, 0.2)),
-        ({"scale_spread": 0.2, "depth_spread": 0.25}, SIZE, (0, 0, math.hypot(0.15, 0.2))),
+        ({"scale_spread": 0.1, "depth_spread": 0.2}, SIZE, (0, 0, math.hypot(0.08, math.sqrt(0.0175)))),
         # Residuals are in pixels of a grid of 832 columns at most, what lies behind infinity in the image's.
         ({"epipolar_px": 0.75, "behind_px": 0.0}, (900, 1664), (1.2, 0, 0)),
         ({"behind_px": 3.0, "behind_infinity": 0.1}, (900, 1664), (3.0, 0, 0)),
     ],
 )
-def test_what_matches_show_and_those_of_right_pairs_do_not_is_a_misfit(found, size, expected):
+def test_what_matches_of_right_pairs_do_not_show_and_a_refined_pose_are_a_misfit(found, size, expected):
     assert misfit_of(Indicators(**found), size) == pytest.approx(expected, abs=1e-9)
 
 
@@ -116,7 +116,7 @@ def test_confidence_keeps_the_share_of_a_normal_error_within_ten_percent():
 
 
 def test_confidence_counts_an_error_that_all_depths_share():
-    """Errors of a match and of all depths together, drawn: of those within 10 % by the first, how many stay."""
+    """Drawn errors of matches, of which some are within 10 %, and how many are once all share another."""
     rng = np.random.default_rng(2)
     depth_m, spread = torch.full((1, 1, *SIZE), 12.0), 0.06
     match = rng.normal(0.0, 0.25 / (100.0 * 0.3 / 12.0), 400_000)

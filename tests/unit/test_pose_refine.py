@@ -604,7 +604,7 @@ def test_a_calibrated_rig_keeps_its_calibration_where_all_matches_fit_it(monkeyp
 
 def test_a_rig_is_not_told_that_another_pose_fits_as_well(monkeypatch) -> None:
     """Its calibration determines the pose; poses of a tracker do not, and forbid trust then."""
-    monkeypatch.setattr(refine, "_MOST_SPREAD", 0.0)  # however little the depths of the two differ
+    monkeypatch.setattr(refine, "MOST_DEPTH_SPREAD", 0.0)  # however little the depths of the two differ
     rig = render_pair(3, size=(240, 320))
     for turn_deg, told in ((0.0, False), (0.7, True)):
         E = rig.E.numpy() @ pose((turn_deg, 0.0, 0.0), (0, 0, 0))

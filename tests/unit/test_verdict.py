@@ -87,6 +87,7 @@ def test_a_good_run_is_trusted_in_silence():
         ({"off_matches": 0.4}, "differs by 49 %"),
         ({"scale_spread": 0.16}, "uncertain by 16 %"),
         ({"scale_spread": 0.16, "points": 2, "given_px": 15.2}, "depth: E misses the matches by 15 px"),
+        ({"scale_spread": 0.08, "depth_spread": 0.14}, "by 8 %, and another pose .* by 15 %"),
     ],
 )
 def test_reasons(signs, words):
