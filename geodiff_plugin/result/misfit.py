@@ -47,7 +47,7 @@ USUAL_SPREAD = 0.15
 
 
 class Misfit(NamedTuple):
-    """Errors that the matches of a run show: those that right pairs do not have, and those of a refined pose."""
+    """Errors that matches show: those that right pairs do not have, and that of a pose that was refined."""
 
     px: float = 0.0  # standard deviation of the shift between the views, pixels of the left image
     distortion: float = 0.0  # size of the radial coefficient k1 that both pictures still have
