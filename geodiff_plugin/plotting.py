@@ -41,7 +41,7 @@ CELL_WIDTH = 480
 #: The colours of the photometric error end at its 98 % quantile, and not below this.
 LEAST_ERROR = 0.05
 VIDEO_SUFFIXES = (".mp4", ".webp", ".gif")
-#: Of legends and titles; it has the letters of most alphabets.
+#: The font of legends and titles, which has the letters of most alphabets.
 FONT = "DejaVuSans.ttf"
 
 

@@ -65,14 +65,3 @@ def make_oracle():
     from tests.tiny import make_oracle
 
     return make_oracle
-
-
-@pytest.fixture
-def plain_pictures(monkeypatch):
-    """Pictures of maps without their colour bars, which take longer to draw than a small pair to guide.
-
-    ``tests/unit/test_plotting.py`` looks at them, and so do some tests of commands.
-    """
-    from PIL import Image
-
-    monkeypatch.setattr("geodiff_plugin.plotting._figure", lambda picture, *_: Image.fromarray(picture))

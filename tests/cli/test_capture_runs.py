@@ -24,8 +24,6 @@ from geodiff_plugin.result.misfit import MATCH_NOISE_PX, expected_error
 from tests.cli.conftest import call
 from tests.unit.capture_room import render, walk, write_transforms
 
-pytestmark = pytest.mark.usefixtures("plain_pictures")
-
 TRUE = walk(10)[3:7]
 QUICK = ["--steps", 1, "--neighbours", 1, "--processes", 1, "--device", "cpu", "-q"]
 

@@ -46,7 +46,6 @@ def test_points_without_a_right_image_and_a_cloud_of_what_is_believed(geodiff, c
     assert not Path("strict").exists()
 
 
-@pytest.mark.usefixtures("plain_pictures")
 def test_a_further_view_takes_part_with_a_lens_of_its_own(geodiff, command, textured_plane):
     """The pair's right image once more, straight and as if its lens had bent it; knobs reach the guidance."""
     Image.fromarray(textured_plane.right).save("third.png")
@@ -103,7 +102,6 @@ def test_every_sentence_of_a_report_has_its_code(geodiff, command):
     assert [m["code"] for m in messages if m["forbids_trust"]] == ["views.same"]
 
 
-@pytest.mark.usefixtures("plain_pictures")
 def test_json_and_quiet(geodiff, command):
     answer = geodiff(*command, *"--json -q --ensemble 2 --steps 1 --resolution 32".split(), *GIVEN)
     assert (answer.code, answer.err) == (0, "")
@@ -116,7 +114,6 @@ def test_json_and_quiet(geodiff, command):
     assert names_in("geodiff-out") == FILES
 
 
-@pytest.mark.usefixtures("plain_pictures")
 def test_seeds_presets_and_range(geodiff, command):
     words = [*command, "-q", "--near", 1, "--far", 5]
     for out, seed in (("a", 1), ("b", 1), ("c", 2)):
@@ -152,7 +149,6 @@ def test_demo_on_real_pairs(geodiff, prior, pair_files, monkeypatch):
             assert np.load(f"geodiff-demo/{name}/depth.npy").shape == left.size[::-1]
 
 
-@pytest.mark.usefixtures("plain_pictures")
 def test_a_focal_length_and_a_baseline_are_enough_and_what_stands_in_is_said(geodiff, command):
     numbers, rest = "--fx 60 --baseline 0.12".split(), [*command[5:], *GIVEN, "--steps", 1, "-q"]
     for name, more in (("few", ()), ("all", "--fy 60 --cx 31.5 --cy 23.5".split())):
@@ -233,7 +229,6 @@ def test_bench(monkeypatch, geodiff, prior):
     assert len(rows) == 2 and ratios == pytest.approx([each / seconds[0] for each in seconds], rel=rounding)
 
 
-@pytest.mark.usefixtures("plain_pictures")
 def test_both_views_in_one_file_are_those_of_two_files(geodiff, command, textured_plane):
     """An MPO of a stereo camera, and one picture with both views beside each other."""
     left, right = (Image.fromarray(view) for view in (textured_plane.left, textured_plane.right))

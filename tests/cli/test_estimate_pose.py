@@ -20,7 +20,6 @@ from tests.scenes import render_pair
 
 pytest.importorskip("poselib")
 
-pytestmark = pytest.mark.usefixtures("plain_pictures")
 
 SIZE = (240, 320)
 VIEWS = {"left": Path("left.png"), "right": Path("right.png")}

@@ -10,8 +10,6 @@ from PIL import Image
 from geodiff_plugin._reprojection import PosedCamera, depth_in_camera
 from tests.cli.conftest import QUICK, report_of
 
-pytestmark = pytest.mark.usefixtures("plain_pictures")
-
 K_TO = [[70.0, 0, 40.0], [0, 70.0, 28.0], [0, 0, 1]]
 E_TO = [[1.0, 0, 0, 0.02], [0, 1, 0, -0.01], [0, 0, 1, 0], [0, 0, 0, 1]]
 CAMERA = {"K": K_TO, "E": E_TO, "width": 80, "height": 56, "frame_id": "colour"}

@@ -21,8 +21,6 @@ from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import find_pairs
 from tests.cli.conftest import QUICK, call, never, report_of, write_pair
 
-pytestmark = pytest.mark.usefixtures("plain_pictures")
-
 COMMAND = ["depth", "left", "right", "--calib", "calib.txt", "--prior", "prior", "--out", "out", *QUICK]
 DEPTHS = [Path("out", name, "depth.npy") for name in "abc"]
 

@@ -22,7 +22,7 @@ UNSURE = ("10o_one_null_pose",)
 DOUBTED_UNIT = "p13_opencv_cm"
 pytestmark = [
     pytest.mark.skipif(not TRUTH.is_dir(), reason="the inputs are not there"),
-    pytest.mark.usefixtures("plain_pictures", "one_prior"),
+    pytest.mark.usefixtures("one_prior"),
 ]
 CASES = sorted(path.name for path in INPUTS.glob("*") if path.name[0] != "_") if TRUTH.is_dir() else []
 #: Commands of the inputs that work as they are, beside which the others were made.

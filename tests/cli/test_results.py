@@ -14,8 +14,6 @@ from geodiff_plugin.formats import read_calibration
 from geodiff_plugin.formats.lenses import distortion_from_text, undistorted
 from tests.cli.conftest import QUICK, report_of
 
-pytestmark = pytest.mark.usefixtures("plain_pictures")
-
 LENS = "-0.2,0.05,0,0"
 
 

@@ -40,9 +40,6 @@ TRUE = walk(COUNT)
 GIVEN = perturbed(TRUE, shift=0.015, turn_deg=2.0, seed=1)
 
 
-pytestmark = pytest.mark.usefixtures("plain_pictures")
-
-
 @pytest.fixture(autouse=True)
 def few_features(monkeypatch):
     """The walls are painted densely: a third of their features is enough, in a ninth of the time."""
