@@ -28,7 +28,7 @@ ALONE = 1024
 #: Warps of a program.
 WARPS = 8
 #: Registers of a thread at most, and programs that a multiprocessor of 65,536 registers then holds.
-MOST_REGISTERS = 168
+MOST_REGISTERS = 224
 RESIDENT = 65_536 // (MOST_REGISTERS * 32 * WARPS)
 #: The first iterate is zero.
 FROM_ZEROS = tl.constexpr(0)
