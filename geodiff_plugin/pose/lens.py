@@ -64,9 +64,10 @@ def undistorted_rays(bent: np.ndarray, k1s: np.ndarray) -> np.ndarray:
 def _residuals(pair: _Pair, k1s: np.ndarray) -> np.ndarray:
     """Signed distances ``(len(k1s), N)`` from the epipolar lines without these distortions, pixels."""
     left, right = np.split(undistorted_rays(pair.bent, k1s), 2, axis=1)
-    of_left = left @ pair.lines[:, :2].T + pair.lines[:, 2]  # (len(k1s), N, 5)
-    off = (of_left[..., :2] * right).sum(-1) + of_left[..., 2]
-    return off / np.maximum(np.hypot(of_left[..., 3], of_left[..., 4]), TINY)
+    of_left = left @ pair.lines[:, :2].T + pair.lines[:, 2]
+    mx, my, mz, nx, ny = np.moveaxis(of_left, -1, 0)  # (len(k1s), N) each
+    off = mx * right[..., 0] + my * right[..., 1] + mz
+    return off / np.maximum(np.hypot(nx, ny), TINY)
 
 
 class Remaining(NamedTuple):
