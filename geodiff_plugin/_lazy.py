@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 
@@ -24,3 +26,22 @@ def importer(package: str, module_of: Mapping[str, str]) -> Callable[[str], Any]
         return value
 
     return get
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Around the imports of a program: the garbage collector leaves out what they make.
+
+    That is half a million objects of torch and its relatives, which stay to the end of the process. The collector
+    would look through them again and again, which takes a fifth of the time of the imports. It is for processes
+    of ours alone, such as a command's: of others, garbage of before the imports would stay as well.
+    """
+    if gc.get_freeze_count() or not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+        gc.freeze()
+    finally:
+        gc.enable()

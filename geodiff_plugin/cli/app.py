@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
+from geodiff_plugin._lazy import uncollected
 from geodiff_plugin.cli.commands import new_group
 from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions, start_pair, with_folder
 from geodiff_plugin.jobs.telling import say, silent
@@ -36,7 +37,8 @@ def _imported(where: str) -> Any:
     # OpenMP's threads spin while they wait, which on a busy machine takes the core from the thread that they
     # wait for; asleep they cost one call in ten on an idle machine and save half of it on a busy one.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    return imported(where)
+    with uncollected():
+        return imported(where)
 
 
 def _later(where: str) -> Callable[[Any], None]:
