@@ -32,9 +32,9 @@ def importer(package: str, module_of: Mapping[str, str]) -> Callable[[str], Any]
 def uncollected() -> Iterator[None]:
     """Around the imports of a program: the garbage collector leaves out what they make.
 
-    That is half a million objects of torch and its relatives, which stay to the end of the process. The collector
-    would look through them again and again, which takes a fifth of the time of the imports. It is for processes
-    of ours alone, such as a command's: of others, garbage of before the imports would stay as well.
+    They make half a million objects of torch and its relatives, which stay to the end of the process. The
+    collector would look through them again and again, which takes a fifth of the time of the imports. This is
+    only for processes of our own, such as a command's: what is garbage before the imports stays as well.
     """
     if gc.get_freeze_count() or not gc.isenabled():
         yield

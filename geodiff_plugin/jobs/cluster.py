@@ -30,7 +30,7 @@ from geodiff_plugin.jobs.ray import Done, Workers, attempt, encoded, guided_refs
 from geodiff_plugin.jobs.rows import GuidedPair
 from geodiff_plugin.jobs.telling import say
 from geodiff_plugin.jobs.writing import write_row
-from geodiff_plugin.priors import find_prior
+from geodiff_plugin.options import imported
 
 #: Rows of a Parquet file at most: many small files are slow to list and to read.
 MOST_ROWS_PER_FILE = 64
@@ -94,6 +94,11 @@ def _as_told(error: Exception) -> InputError:
 
 def _workers(options: Any) -> Workers:
     return Workers(options.workers, options.gpus)
+
+
+def _check_prior(options: DepthOptions) -> None:
+    """Refuse an unknown prior before a cluster starts. A worker that writes does not import the priors."""
+    imported("priors.find_prior")(options.prior)
 
 
 def _alone(options: DepthOptions) -> DepthOptions:
@@ -170,7 +175,7 @@ def pairs_to_folders(
     Raises:
         InputError: all pairs fail for one reason; no such prior; a full disk.
     """
-    find_prior(options.prior)  # before a cluster starts
+    _check_prior(options)
 
     def work(left: list[Item]) -> Iterator[Done]:
         workers = _workers(options)
@@ -231,7 +236,7 @@ def pairs_to_parquet(
     Raises:
         InputError: all pairs fail for one reason; no such prior; results of other options; a full disk.
     """
-    find_prior(options.prior)
+    _check_prior(options)
     store, failures = Store.of(options), Failures(len(refs), "pair", say)
     with connected():
         keys = store.begin(_alone(options))

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from geodiff_plugin._checks import InputError, refuse
@@ -16,7 +14,6 @@ from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin._threads import Beside, WithinCores, available_cores, leaves_cpu_free
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.evidence.store import EvidenceStore
-from geodiff_plugin.formats import recordings
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.formats.reading import has_pose_per_image
 from geodiff_plugin.jobs.failures import full_disk
@@ -33,6 +30,7 @@ from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcesses
 from geodiff_plugin.jobs.steady import write_steady_frames
 from geodiff_plugin.jobs.tables import write_table
 from geodiff_plugin.jobs.telling import Tell, silent
+from geodiff_plugin.jobs.views import Views
 from geodiff_plugin.jobs.writing import write_row
 from geodiff_plugin.options import imported
 from geodiff_plugin.runtime.machine import pick_device
@@ -60,31 +58,6 @@ def _ends_run_if_all_would_fail() -> Iterator[None]:
         if (full := full_disk(error)) is not None:
             raise _EndsRun from full
         raise
-
-
-class Views:
-    """The images of pairs that are frames of videos or of a bag, each opened once."""
-
-    def __init__(self, options: DepthOptions) -> None:
-        self._options = options
-        self._videos, self._open = dict[Path, recordings.VideoReader | recordings.BagReader](), ExitStack()
-
-    def close(self) -> None:
-        """Close the videos."""
-        self._open.close()
-
-    def of(self, ref: PairRef) -> Sequence[np.ndarray] | None:
-        """Left and right view of a pair of frames, ``(H, W, 3)`` in [0, 1]; ``None`` for one of files."""
-        if (frame := ref.frame) is None:
-            return None
-        for path in {ref.left, ref.right or ref.left} - set(self._videos):
-            bag = (self._options.bag_topics(), self._options.tolerance) if recordings.is_bag(path) else None
-            reader: Any = recordings.VideoReader(path) if bag is None else recordings.BagReader(path, *bag)
-            self._videos[path] = self._open.enter_context(reader)
-        left = self._videos[ref.left].read(frame)
-        if ref.right is None:
-            return recordings.both_halves(left, "LEFT")
-        return left, self._videos[ref.right].read(frame)
 
 
 @dataclass(eq=False)

@@ -17,30 +17,22 @@ from dataclasses import dataclass, replace
 from functools import partial
 from math import ceil
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pyarrow as pa
 import ray
 import ray.data
 
 from geodiff_plugin._checks import InputError
+from geodiff_plugin._lazy import uncollected
 from geodiff_plugin.jobs.failures import full_disk
-from geodiff_plugin.jobs.finished import Row
 from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.jobs.pair import run_pair
 from geodiff_plugin.jobs.pairs import PairRef
-from geodiff_plugin.jobs.prior import graphs_for_many, prior_of_options
-from geodiff_plugin.jobs.rows import (
-    COLUMNS,
-    IMAGES,
-    GuidedPair,
-    ReadPair,
-    check_names,
-    read_columns,
-    read_ref,
-    result_columns,
-)
-from geodiff_plugin.runtime.machine import pick_device
+from geodiff_plugin.options import imported
+
+if TYPE_CHECKING:
+    from geodiff_plugin.jobs.finished import Row
+    from geodiff_plugin.jobs.rows import ReadPair
 
 #: Share of a CPU for a task that reads or encodes. It differs from ``GUIDE_CPUS``, because Ray fuses stages
 #: that ask for the same, and would read inside the actor, while its GPU waits.
@@ -128,9 +120,9 @@ def depth_dataset(ds: Any, *, workers: Workers = Workers(), **options: Any) -> A
 
     Every call takes one pair, so that the result of a row does not depend on the rows beside it.
     """
-    check_names(options)
+    imported("jobs.rows.check_names")(options)
     base = DepthOptions(left=Path(), **options)
-    return encoded(_guided(ds, partial(read_columns, base), base, workers), workers)
+    return encoded(_guided(ds, partial(_read_columns, base), base, workers), workers)
 
 
 def guided_refs(refs: Sequence[PairRef], options: DepthOptions, workers: Workers) -> Any:
@@ -193,12 +185,26 @@ def _hand_over(kept: Row, state: Any) -> Row:
     return kept | {STATE: b"" if state is None else pickle.dumps(state)}
 
 
+def _in_worker(where: str) -> Any:
+    """What a stage needs, by its dotted name, imported when the stage begins.
+
+    This module itself imports little, so that what tasks need is not all that an actor needs.
+    """
+    with uncollected():
+        return imported(where)
+
+
+def _read_columns(base: DepthOptions, row: Row) -> ReadPair:
+    return _in_worker("jobs.rows.read_columns")(base, row)
+
+
 def _read_ref(options: DepthOptions, row: Row) -> ReadPair:
-    return read_ref(options, pickle.loads(row[STATE]))
+    return _in_worker("jobs.rows.read_ref")(options, pickle.loads(row[STATE]))
 
 
 def _read(read: Callable[[Row], ReadPair], row: Row) -> Row:
-    kept = {name: value for name, value in row.items() if name not in (*IMAGES, STATE)}
+    inputs = {*_in_worker("jobs.rows.IMAGES"), STATE}
+    kept = {name: value for name, value in row.items() if name not in inputs}
     pair, error = None, None
     try:
         pair = read(row)
@@ -211,27 +217,22 @@ class _Guide:
     """An actor: it holds the prior, and makes the guided calls."""
 
     def __init__(self, options: DepthOptions) -> None:
-        device = pick_device(options.device)
-        options = replace(options, graphs=graphs_for_many(options, device))
-        self._pipe = prior_of_options(options, device)
+        self._held = _in_worker("jobs.held.HeldPrior")(options)
 
     def __call__(self, row: Row) -> Row:
-        return _hand_over(*attempt(row, self._run))
-
-    def _run(self, pair: ReadPair) -> GuidedPair:
-        return GuidedPair(run_pair(self._pipe, pair.options, pair.inputs, pair.log), pair.entries)
+        return _hand_over(*attempt(row, self._held.guide))
 
 
 def _encode(row: Row) -> Row:
     """The row of a result; of a pair that failed the columns are empty, and the error says why."""
-    kept, columns = attempt(row, result_columns)
-    empty = dict.fromkeys(COLUMNS)
+    kept, columns = attempt(row, _in_worker("jobs.rows.result_columns"))
+    empty = dict.fromkeys(_in_worker("jobs.rows.COLUMNS"))
     return kept | empty | (columns or {"error": kept["error"]})
 
 
 def _typed(table: pa.Table) -> pa.Table:
     """The columns of a result in their types, also where all rows of a batch have failed."""
-    for name, alias in COLUMNS.items():
+    for name, alias in _in_worker("jobs.rows.COLUMNS").items():
         values = table[name].cast(pa.type_for_alias(alias))
         table = table.set_column(table.schema.get_field_index(name), name, values)
     return table

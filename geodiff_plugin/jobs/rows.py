@@ -17,12 +17,12 @@ from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.depth import depth_mm
 from geodiff_plugin.formats.files import save_png
 from geodiff_plugin.jobs.finished import Row, file_digests, row_of
-from geodiff_plugin.jobs.many import Views
 from geodiff_plugin.jobs.options import DepthOptions, check_files
 from geodiff_plugin.jobs.pairs import PairRef, options_of
 from geodiff_plugin.jobs.reading import PairInputs, read_pair
 from geodiff_plugin.jobs.records import JobLog, PairRun
 from geodiff_plugin.jobs.report import build_report, single_map
+from geodiff_plugin.jobs.views import Views
 
 #: Columns with the two images, as paths or as the bytes of image files.
 IMAGES = ("left", "right")
