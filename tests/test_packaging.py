@@ -33,6 +33,22 @@ def test_start_is_light(code: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_the_collector_leaves_out_what_a_command_imports() -> None:
+    code = """
+import gc
+from geodiff_plugin._lazy import uncollected
+with uncollected():
+    during, imported = gc.isenabled(), [[] for _ in range(1000)]
+frozen = gc.get_freeze_count()
+assert not during and gc.isenabled() and frozen >= 1000
+with uncollected():  # what others made in between may be garbage
+    during, later = gc.isenabled(), [[] for _ in range(1000)]
+assert during and gc.get_freeze_count() == frozen
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_type_checkers_see_the_public_names() -> None:
     """What is imported on first use is imported for type checkers too, from the same module."""
     tree = ast.parse((ROOT / "geodiff_plugin" / "__init__.py").read_text(encoding="utf-8"))

@@ -51,9 +51,14 @@ class SeparateProcess:
     """
 
     def __init__(self, module: str) -> None:
-        code = f"import sys; sys.path[:] = {sys.path!r}; import {__name__} as own, {module}; own.serve()"
+        lines = [
+            f"import sys; sys.path[:] = {sys.path!r}",
+            "from geodiff_plugin._lazy import uncollected",
+            f"with uncollected(): import {__name__}, {module}",
+            f"{__name__}.serve()",
+        ]
         self._process = subprocess.Popen(
-            [sys.executable, "-c", code],
+            [sys.executable, "-c", "\n".join(lines)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,

@@ -219,8 +219,10 @@ def test_a_map_of_another_model_as_the_prior(geodiff, pair_files, textured_plane
 
 
 @pytest.mark.slow
-def test_bench(monkeypatch, geodiff, prior):
+def test_bench(monkeypatch, geodiff, prior, pair_files):
+    """The two calls on the demo pair; the commands, whose seconds nothing here depends on, on a small one."""
     monkeypatch.setattr("geodiff_plugin.priors.loading.BUNDLED_FOLDER", prior)
+    monkeypatch.setattr("geodiff_plugin.cli.demo.DEMO_PAIR_FOLDER", pair_files.folder)
     printed = geodiff("bench", "--device", "cpu").out
     assert re.search(r"geodiff depth: [\d.]+ s \(start .*guided call [\d.]+, write", printed)
     rows = [line.split() for line in printed.splitlines() if line.lstrip().startswith(("plain", "guided"))]
