@@ -21,6 +21,7 @@ UNSURE = ("10o_one_null_pose",)
 #: Centimetres that nothing names.
 DOUBTED_UNIT = "p13_opencv_cm"
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.skipif(not TRUTH.is_dir(), reason="the inputs are not there"),
     pytest.mark.usefixtures("one_prior"),
 ]
