@@ -26,9 +26,8 @@ def executed(notebook: Path) -> Any:
     os.environ.update(HF_HUB_OFFLINE="1", JUPYTER_PLATFORM_DIRS="1")
     with tempfile.TemporaryDirectory() as folder:
         resources = {"metadata": {"path": folder}}
-        nbclient.NotebookClient(
-            loaded, timeout=TIMEOUT_S, kernel_name="python3", resources=resources, record_timing=False
-        ).execute()
+        times = {"timeout": TIMEOUT_S, "startup_timeout": TIMEOUT_S, "record_timing": False}
+        nbclient.NotebookClient(loaded, kernel_name="python3", resources=resources, **times).execute()
     for cell in loaded.cells:
         cell.metadata.clear()
         outputs = cell.get("outputs", [])
