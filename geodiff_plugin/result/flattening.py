@@ -4,20 +4,24 @@ Beyond the paper, whose result is the decoded latent. A blank wall's matches are
 it err alike, so a fit that follows them makes blotches of a wall. A plane in space is a plane in inverse
 depth over the pixels: its slope is the same everywhere, which a smoothness of first order does not know.
 Smoothing in two steps, slopes and then values, after Bredies, Kunisch and Pock, Total Generalized Variation,
-SIAM J. Imaging Sci. 2010, here with squares, whose minimisers ``solve_field`` finds.
+SIAM J. Imaging Sci. 2010, here with squares, whose minimisers ``solve_field`` finds. The second step is
+taken on the grid of the matches and once more on that of the image, for what is finer than the first grid.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._kernels import use_kernel
-from geodiff_plugin.algorithm.correction import edge_links, log_depth_at
+from geodiff_plugin.algorithm.correction import DEPTH_EDGE, edge_links, log_depth_at
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
-from geodiff_plugin.geometry import image_size
+from geodiff_plugin.geometry import constant_like, image_size
 from geodiff_plugin.matching import Matches, known_shape
+from geodiff_plugin.matching.rows import grid_of_rows
 
 #: How much a slope resists its neighbours' where nothing is known: all slopes count a little, as a wall on
 #: which nothing is known has no others.
@@ -28,8 +32,12 @@ SLOPE_SMOOTHNESS = 300.0
 SLOPES = 40.0
 #: Weight of a value where nothing is known, for a prior of ``WEAK_PRIOR`` or worse: it holds wide shapes.
 LEAST_VALUE_WEIGHT = 0.02
-#: Error of a prior from which that weight is the least. It grows as the fourth power of a smaller error, as
-#: the stiffness of the fit does: the surfaces of a good prior need no smoothing.
+#: The same on the grid of the image, where only detail of a few pixels is to go.
+LEAST_DETAIL_WEIGHT = 0.5
+#: Step in log depth across which detail is not smoothed: less than ``DEPTH_EDGE``, so that edges stay sharp.
+DETAIL_EDGE = 0.03
+#: Error of a prior from which these weights are the least. They grow as the fourth power of a smaller error,
+#: as the stiffness of the fit does: the surfaces of a good prior need no smoothing.
 WEAK_PRIOR = 0.1
 #: The largest weight of a value: there the depth stays.
 MOST_VALUE_WEIGHT = 1e3
@@ -37,6 +45,14 @@ MOST_VALUE_WEIGHT = 1e3
 STEPS = 8
 #: The inverse depth is never lowered below this share of itself.
 LEAST_SHARE = 0.3
+
+
+class _Surface(NamedTuple):
+    """A map on one grid, ``(1, 1, h, w)``."""
+
+    log_depth: Tensor
+    inverse: Tensor  # about 1, so that no weight depends on the unit
+    links: tuple[Tensor, Tensor]  # ``edge_links``, across and down
 
 
 @torch.no_grad()
@@ -49,6 +65,11 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor) ->
     argmin sum w e^2 + SLOPES sum g |grad (q + e) - t|^2`` and ``w = k^2 / (1 - k) + w_0``, where ``w_0`` is
     ``LEAST_VALUE_WEIGHT`` of a weak prior, and more of a better one.
 
+    The map has detail finer than the grid of the matches: upsampling, sharpened edges and votes leave specks
+    of a pixel or a few. So the second problem is solved once more, for ``q + e`` in place of ``q``, on the
+    grid of the votes. There ``w_0`` is ``LEAST_DETAIL_WEIGHT``, so that only detail changes, and a step of
+    ``DETAIL_EDGE`` in log depth is an edge.
+
     Args:
         depth_m: ``(1, 1, H, W)`` metres, fitted to the matches and voted on by them.
         target: the matches.
@@ -58,32 +79,82 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor) ->
     Returns:
         As ``depth_m``.
     """
-    log_depth = log_depth_at(depth_m, target.size)
-    known = known_shape(target, torch.exp(-log_depth))
-    guide = F.interpolate(left_01.float(), target.size, mode="bilinear", antialias=True)
-    inverse = torch.exp(log_depth.mean() - log_depth)  # about 1, so that no weight depends on the unit
-    links = edge_links(guide, log_depth)
-    least = LEAST_VALUE_WEIGHT * (WEAK_PRIOR / error).clamp_min(1.0) ** 4
-    weight = (known**2 / (1.0 - known).clamp_min(1e-6) + least).clamp_max(MOST_VALUE_WEIGHT)
-    pull = _towards_smoothed(inverse, known, links)
-    change = solve_field(FieldSystem(weight, pull, SLOPES * links[0], SLOPES * links[1]), STEPS)
-    factor = (1.0 + change / inverse).clamp_min(LEAST_SHARE).log()
+    unit, good = depth_m.float().log().mean(), (WEAK_PRIOR / error).clamp_min(1.0) ** 4
+    surface = _surface(depth_m, target.size, left_01, unit, DEPTH_EDGE)
+    known = known_shape(target, torch.exp(-surface.log_depth))
+    slopes = _smoothed(surface, known)
+    change = _towards(slopes, surface, _weight(known, LEAST_VALUE_WEIGHT * good))
+    flat_m = _changed(depth_m, surface, change)
+    size = grid_of_rows(image_size(depth_m))
+    surface = _surface(flat_m, size, left_01, unit, DETAIL_EDGE)
+    known, slopes = (F.interpolate(x, size, mode="bilinear", align_corners=False) for x in (known, slopes))
+    slopes = slopes * constant_like(slopes, target.size[1] / size[1], target.size[0] / size[0]).view(
+        2, 1, 1, 1
+    )
+    weight = _weight(known, LEAST_DETAIL_WEIGHT * good)
+    change = _towards(slopes, surface, weight, torch.zeros_like(known))
+    return _changed(flat_m, surface, change).to(depth_m.dtype)
+
+
+def _surface(depth_m: Tensor, size: tuple[int, int], left_01: Tensor, unit: Tensor, edge: float) -> _Surface:
+    """A map on a grid, with links that fall to a third across a step of ``edge`` in log depth."""
+    log_depth = log_depth_at(depth_m, size)
+    guide = F.interpolate(left_01.float(), size, mode="bilinear", antialias=True)
+    links = edge_links(guide, log_depth * (DEPTH_EDGE / edge))
+    return _Surface(log_depth, torch.exp(unit - log_depth), links)
+
+
+def _weight(known: Tensor, least: Tensor) -> Tensor:
+    return (known**2 / (1.0 - known).clamp_min(1e-6) + least).clamp_max(MOST_VALUE_WEIGHT)
+
+
+def _changed(depth_m: Tensor, surface: _Surface, change: Tensor) -> Tensor:
+    """A map ``(1, 1, H, W)`` whose inverse depth changes as that of a surface on its own grid."""
+    factor = (1.0 + change / surface.inverse).clamp_min(LEAST_SHARE).log()
     factor = F.interpolate(factor, image_size(depth_m), mode="bilinear", align_corners=False)
-    return (depth_m * torch.exp(-factor)).to(depth_m.dtype)
+    return depth_m * torch.exp(-factor)
 
 
-def _towards_smoothed(inverse: Tensor, known: Tensor, links: tuple[Tensor, Tensor]) -> Tensor:
-    """The pull ``(1, 1, h, w)`` of values whose slopes are drawn to the smoothed ones."""
+def _smoothed(surface: _Surface, known: Tensor) -> Tensor:
+    """Smoothed slopes ``(2, 1, h, w)`` across and down, each at the first of its two pixels."""
+    weight, pull = _slopes(surface.inverse, known, surface.links)
+    across, down = surface.links
+    return solve_field(FieldSystem(weight, pull, SLOPE_SMOOTHNESS * across, SLOPE_SMOOTHNESS * down), STEPS)
+
+
+def _towards(slopes: Tensor, surface: _Surface, weight: Tensor, start: Tensor | None = None) -> Tensor:
+    """The change ``(1, 1, h, w)`` that draws the values of a surface to ``slopes (2, 1, h, w)``.
+
+    ``weight`` resists it. With a ``start`` only what ``STEPS`` steps reach changes.
+    """
+    pull = _forces(surface.inverse, slopes, surface.links)
+    across, down = surface.links
+    return solve_field(FieldSystem(weight, pull, SLOPES * across, SLOPES * down), STEPS, start)
+
+
+def _slopes(inverse: Tensor, known: Tensor, links: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Weight and pull ``(2, 1, h, w)`` of the slopes across and down."""
     if use_kernel(inverse):
         from geodiff_plugin.result import flattening_kernels as kernels
 
-        weight, pull = kernels.slopes(inverse, known, links)  # of both axes, as a batch
-        system = FieldSystem(weight, pull, SLOPE_SMOOTHNESS * links[0], SLOPE_SMOOTHNESS * links[1])
-        return kernels.forces(inverse, solve_field(system, STEPS), links)
-    pull = torch.zeros_like(inverse)
+        return kernels.slopes(inverse, known, links)
+    own, weights, pulls = known**2 + LEAST_SLOPE_WEIGHT, [], []
     for axis, link in zip((-1, -2), links, strict=True):
+        weights.append(_after(link, axis, first=False) * own + 1e-6)
+        pulls.append(weights[-1] * _after(inverse.diff(dim=axis), axis, first=False))
+    return torch.cat(weights), torch.cat(pulls)
+
+
+def _forces(inverse: Tensor, slopes: Tensor, links: tuple[Tensor, Tensor]) -> Tensor:
+    """The pull ``(1, 1, h, w)`` of values whose slopes are drawn to ``slopes (2, 1, h, w)``."""
+    if use_kernel(inverse):
+        from geodiff_plugin.result import flattening_kernels as kernels
+
+        return kernels.forces(inverse, slopes, links)
+    pull = torch.zeros_like(inverse)
+    for axis, link, smoothed in zip((-1, -2), links, slopes, strict=True):
         slope = inverse.diff(dim=axis)
-        force = SLOPES * link * (_smoothed(slope, axis, known, links) - slope)
+        force = SLOPES * link * (smoothed.narrow(axis, 0, slope.shape[axis]) - slope)
         pull += _after(force, axis, first=True) - _after(force, axis, first=False)
     return pull
 
@@ -92,12 +163,3 @@ def _after(between: Tensor, axis: int, *, first: bool) -> Tensor:
     """Values between neighbours along an axis, padded with one 0 at the first or at the last pixel."""
     ends = (1, 0) if first else (0, 1)
     return F.pad(between, ends if axis == -1 else (0, 0, *ends))
-
-
-def _smoothed(slope: Tensor, axis: int, known: Tensor, links: tuple[Tensor, ...]) -> Tensor:
-    """Slopes between neighbours along an axis, smoothed along both: each at the first of its two pixels."""
-    link = links[0] if axis == -1 else links[1]
-    weight = _after(link, axis, first=False) * (known**2 + LEAST_SLOPE_WEIGHT) + 1e-6
-    pull = weight * _after(slope, axis, first=False)
-    system = FieldSystem(weight, pull, SLOPE_SMOOTHNESS * links[0], SLOPE_SMOOTHNESS * links[1])
-    return solve_field(system, STEPS).narrow(axis, 0, slope.shape[axis])

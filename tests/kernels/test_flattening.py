@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin.algorithm import solver
+from geodiff_plugin.matching import Matches
 from geodiff_plugin.result import flattening
 from tests.kernels.drawn import drawn
 
@@ -15,10 +16,7 @@ from tests.kernels.drawn import drawn
 @given(seed=st.integers(0, 999), size=st.tuples(st.integers(5, 27), st.integers(5, 27)))
 @example(seed=0, size=(23, 26))
 def test_values_are_drawn_to_the_same_smoothed_slopes(device, seed, size):
-    """Both axes are smoothed as one batch, in the reference one after the other.
-
-    Of fewer pixels the solves converge, and what is left is rounding that the smoothness magnifies.
-    """
+    """Of fewer pixels the solves converge, and what is left is rounding that the smoothness magnifies."""
     generator, (height, width) = torch.Generator().manual_seed(seed), size
 
     def drawn(*shape: int) -> torch.Tensor:
@@ -26,11 +24,36 @@ def test_values_are_drawn_to_the_same_smoothed_slopes(device, seed, size):
 
     inverse, known = 0.5 + drawn(height, width), drawn(height, width) ** 3
     links = drawn(height, width - 1) + 1e-3, drawn(height - 1, width) + 1e-3
+    surface = flattening._Surface(-inverse.log(), inverse, links)
+
+    def pulled() -> torch.Tensor:
+        return flattening._forces(inverse, flattening._smoothed(surface, known), links)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(solver, "COARSEST_STEPS", 6)
         patch.setattr(flattening, "STEPS", 2)
-        found = flattening._towards_smoothed(inverse, known, links)
+        found = pulled()
         with without_kernels():
-            expected = flattening._towards_smoothed(inverse, known, links)
+            expected = pulled()
     assert found.shape == expected.shape
     assert (found - expected).abs().max() <= 1e-5 * expected.abs().max()
+
+
+@drawn(2)
+@given(seed=st.integers(0, 999))
+@example(seed=0)
+def test_a_map_is_flattened_alike_on_both_grids(device, seed):
+    """A map of twice the size of its matches, the last row and column of which lie in no whole cell."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def drawn(channels: int, *size: int) -> torch.Tensor:
+        return torch.rand(1, channels, *size, generator=generator).to(device)
+
+    depth_m, left_01 = 2.0 + 0.1 * drawn(1, 55, 63), drawn(3, 55, 63)
+    step = torch.tensor([0.01], device=device)
+    matches = Matches(0.5 + drawn(1, 27, 31), drawn(1, 27, 31), step, 1.0 + 9.0 * drawn(1, 27, 31))
+    error = torch.full((1, 1, 1, 1), 0.15, device=device)
+    found = flattening.flatten(depth_m, matches, left_01, error)
+    with without_kernels():
+        expected = flattening.flatten(depth_m, matches, left_01, error)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=0.0)
