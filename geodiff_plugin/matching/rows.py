@@ -171,7 +171,7 @@ def match_rows(pictures: RowPictures, nearest_px: float) -> RowMatches:
     left, right = pictures.greys()
     shift, known = _row_shifts(left, right, pictures.infinity_px, nearest_px)
     gaps = find_gaps(known)
-    is_hidden = hidden_gaps(shift, gaps)
+    is_hidden = hidden_gaps(shift, gaps, pictures.infinity_px)
     hidden, filled = (gaps.put(np.zeros_like(known), each) for each in (is_hidden, gaps.inner & ~is_hidden))
     whole = fill_background(shift, gaps) if known.any() else np.zeros_like(shift)
     way = slice(None, None, -1 if pictures.shift_m > 0 else 1)  # mirrored pictures are mirrored back

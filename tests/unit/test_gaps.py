@@ -65,9 +65,10 @@ def test_a_map_without_gaps_stays_and_given_gaps_count_instead_of_what_is_not_fi
     assert fill_background(shift, gaps).tolist() == [[4.0, 2.0, 2.0], [5.0, 5.0, 5.0]]
 
 
-def hidden_pixels(shift: np.ndarray, known: np.ndarray) -> np.ndarray:
+def hidden_pixels(shift: np.ndarray, known: np.ndarray, infinity_px: float = -20.0) -> np.ndarray:
+    """By default a point at infinity is 20 px further to the right in the right view, which sees it all."""
     gaps = find_gaps(known)
-    return gaps.put(np.zeros_like(known), hidden_gaps(shift, gaps))
+    return gaps.put(np.zeros_like(known), hidden_gaps(shift, gaps, infinity_px))
 
 
 def test_a_gap_is_hidden_where_it_is_no_wider_than_the_step_beside_it():
@@ -79,6 +80,15 @@ def test_a_gap_is_hidden_where_it_is_no_wider_than_the_step_beside_it():
     assert found[0].tolist() == (~known[0]).tolist()
     assert not found[1:].any()
     assert not hidden_pixels(shift[:, 5:], known[:, 5:]).any()  # the gap has no farther end
+
+
+@pytest.mark.parametrize(("infinity_px", "hides"), [(-5.0, True), (-4.0, True), (-3.0, False), (0.0, False)])
+def test_a_gap_is_not_hidden_where_the_right_view_would_not_see_the_near_surface_either(infinity_px, hides):
+    """The right view begins at its column 0, where it sees column ``8 + infinity_px`` of the near surface."""
+    shift = np.array([[3.0] * 4 + [0.0] * 6 + [8.0] * 6], np.float32)
+    assert hidden_pixels(shift, shift > 0, infinity_px)[0].tolist() == [
+        hides and 4 <= column < 10 for column in range(16)
+    ]
 
 
 @pytest.mark.parametrize(("step", "hides"), [(1.9, False), (2.1, True)])
