@@ -61,14 +61,14 @@ def hidden_gaps(shift: np.ndarray, gaps: Gaps, infinity_px: float) -> np.ndarray
     """``(N,)`` bool: gaps between matches that a view to the right cannot see.
 
     A surface hides a strip of what is behind its left edge, and the strip is as wide as the shift of the near
-    surface exceeds that of the far one. A wider gap, or one without such a step, has another reason. So may one
-    near the left border, where the near surface itself would be out of the right view: there it goes on
-    unmatched, and what is matched left of the gap is often chance.
+    surface exceeds that of the far one. A wider gap, or one without such a step, has another reason. So may a
+    gap near the left border, where the right view would not see the near surface either: this goes on there
+    unmatched, and what is matched beyond the gap is often chance.
 
     Args:
         shift: ``(H, W)`` pixels; it falls with depth.
         gaps: where it is not matched.
-        infinity_px: disparity of a point at infinity, in addition to which a shift is one.
+        infinity_px: disparity of a point at infinity, from which shifts are counted.
     """
     left, right = gaps.ends(shift, np.nan)
     step, in_view = right - left, gaps.first >= right + infinity_px
