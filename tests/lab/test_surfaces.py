@@ -9,7 +9,7 @@ import torch
 from geodiff_plugin import GeometryGuidance, Rig, enable_geometry_guidance, load_prior
 from geodiff_plugin._checks import InputError
 from geodiff_plugin.evaluation.datasets import find_pairs, load
-from tests.lab.surfaces import STAGES, draw_stages, flatness, guided_stages, main
+from tests.lab.surfaces import STAGES, draw_stages, flatness, guided_stages, main, specks
 
 SMALL = "synthetic-plain:1@160x120"
 
@@ -37,6 +37,17 @@ def test_noise_shows_in_percent_of_the_planes_mean_and_outliers_in_the_rms_alone
     spoiled = flatness(1.0 / (1.0 / wall + noise + some * mean), inside)
     assert spoiled.rms > 20.0
     assert spoiled.mad < 4.0
+
+
+def test_specks_are_detail_of_few_pixels_and_no_slope_or_wide_wave():
+    wall, inside = slanted_wall(), np.ones((60, 80), bool)
+    inside[:3], inside[-3:], inside[:, :3], inside[:, -3:] = (False,) * 4  # a slope ends at the border
+    assert specks(wall, inside) < 0.1
+    wave = 1.0 + 0.02 * np.sin(np.indices(wall.shape)[1] / 20.0)
+    assert specks(wall * wave, inside) < 0.1
+    some = np.random.default_rng(0).random(wall.shape) < 0.03
+    assert specks(wall / (1.0 + 0.02 * some), inside) == pytest.approx(20.0, rel=0.3)
+    assert specks(wall / (1.0 + 0.02 * some), inside & ~some) < 3.0
 
 
 @pytest.mark.slow
