@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._kernels import use_kernel
-from geodiff_plugin.algorithm.correction import DEPTH_EDGE, edge_links, log_depth_at
+from geodiff_plugin.algorithm.correction import DEPTH_EDGE, edge_links
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
 from geodiff_plugin.geometry import constant_like, image_size
 from geodiff_plugin.matching import Matches, known_shape
@@ -39,11 +39,11 @@ DETAIL_EDGE = 0.03
 #: Error of a prior from which these weights are the least. They grow as the fourth power of a smaller error,
 #: as the stiffness of the fit does: the surfaces of a good prior need no smoothing.
 WEAK_PRIOR = 0.1
-#: The largest weight of a value: there the depth stays.
+#: The largest weight of a value that is known: there the depth stays.
 MOST_VALUE_WEIGHT = 1e3
 #: Conjugate-gradient steps on each grid of the solver's pyramid.
 STEPS = 8
-#: The inverse depth is never lowered below this share of itself.
+#: The inverse depth is never lowering below this share of itself.
 LEAST_SHARE = 0.3
 
 
@@ -79,40 +79,47 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor) ->
     Returns:
         As ``depth_m``.
     """
-    unit, good = depth_m.float().log().mean(), (WEAK_PRIOR / error).clamp_min(1.0) ** 4
-    surface = _surface(depth_m, target.size, left_01, unit, DEPTH_EDGE)
+    log_depth = depth_m.float().log()
+    unit, good = log_depth.mean(), (WEAK_PRIOR / error).clamp_min(1.0) ** 4
+    surface = _surface(log_depth, target.size, left_01, unit)
     known = known_shape(target, torch.exp(-surface.log_depth))
-    slopes = _smoothed(surface, known)
-    change = _towards(slopes, surface, _weight(known, LEAST_VALUE_WEIGHT * good))
-    flat_m = _changed(depth_m, surface, change)
+    slopes, held = _smoothed(surface, known), _held(known)
+    change = _towards(slopes, surface, held + LEAST_VALUE_WEIGHT * good)
+    lowering = _on(_lowering(surface, change), image_size(depth_m))
     size = grid_of_rows(image_size(depth_m))
-    surface = _surface(flat_m, size, left_01, unit, DETAIL_EDGE)
-    known, slopes = (F.interpolate(x, size, mode="bilinear", align_corners=False) for x in (known, slopes))
-    slopes = slopes * constant_like(slopes, target.size[1] / size[1], target.size[0] / size[0]).view(
-        2, 1, 1, 1
-    )
-    weight = _weight(known, LEAST_DETAIL_WEIGHT * good)
-    change = _towards(slopes, surface, weight, torch.zeros_like(known))
-    return _changed(flat_m, surface, change).to(depth_m.dtype)
+    surface = _surface(log_depth - lowering, size, left_01, unit, DETAIL_EDGE)
+    finer = constant_like(slopes, target.size[1] / size[1], target.size[0] / size[0]).view(2, 1, 1, 1)
+    weight = _on(held, size) + LEAST_DETAIL_WEIGHT * good
+    change = _towards(finer * _on(slopes, size), surface, weight, torch.zeros_like(weight))
+    lowering = lowering + _on(_lowering(surface, change), image_size(depth_m))
+    return (depth_m * torch.exp(-lowering)).to(depth_m.dtype)
 
 
-def _surface(depth_m: Tensor, size: tuple[int, int], left_01: Tensor, unit: Tensor, edge: float) -> _Surface:
+def _on(x: Tensor, size: tuple[int, int], *, antialias: bool = False) -> Tensor:
+    """A map ``(B, C, h, w)`` on another grid."""
+    if image_size(x) == size:
+        return x
+    return F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=antialias)
+
+
+def _surface(
+    log_depth: Tensor, size: tuple[int, int], left_01: Tensor, unit: Tensor, edge: float = DEPTH_EDGE
+) -> _Surface:
     """A map on a grid, with links that fall to a third across a step of ``edge`` in log depth."""
-    log_depth = log_depth_at(depth_m, size)
-    guide = F.interpolate(left_01.float(), size, mode="bilinear", antialias=True)
-    links = edge_links(guide, log_depth * (DEPTH_EDGE / edge))
+    log_depth = _on(log_depth, size)
+    steps = log_depth if edge == DEPTH_EDGE else log_depth * (DEPTH_EDGE / edge)
+    links = edge_links(_on(left_01.float(), size, antialias=True), steps)
     return _Surface(log_depth, torch.exp(unit - log_depth), links)
 
 
-def _weight(known: Tensor, least: Tensor) -> Tensor:
-    return (known**2 / (1.0 - known).clamp_min(1e-6) + least).clamp_max(MOST_VALUE_WEIGHT)
+def _held(known: Tensor) -> Tensor:
+    """The weight of values by what is known of them."""
+    return (known**2 / (1.0 - known).clamp_min(1e-6)).clamp_max(MOST_VALUE_WEIGHT)
 
 
-def _changed(depth_m: Tensor, surface: _Surface, change: Tensor) -> Tensor:
-    """A map ``(1, 1, H, W)`` whose inverse depth changes as that of a surface on its own grid."""
-    factor = (1.0 + change / surface.inverse).clamp_min(LEAST_SHARE).log()
-    factor = F.interpolate(factor, image_size(depth_m), mode="bilinear", align_corners=False)
-    return depth_m * torch.exp(-factor)
+def _lowering(surface: _Surface, change: Tensor) -> Tensor:
+    """By how much a change of its inverse depth lowers the log depth of a surface."""
+    return (1.0 + change / surface.inverse).clamp_min(LEAST_SHARE).log()
 
 
 def _smoothed(surface: _Surface, known: Tensor) -> Tensor:
