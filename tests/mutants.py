@@ -350,7 +350,7 @@ MUTANTS = [
         ("OWN_METRES = math.log(1.9)", "OWN_METRES = math.log(2.1)"),
         ("EPIPOLAR_WRONG = 4.0", "EPIPOLAR_WRONG = 5.0"),
         ("MOST_SCALE_SPREAD = 0.1", "MOST_SCALE_SPREAD = 0.12"),
-        ("found.depth_spread / MOST_DEPTH_SPREAD) > 1.0", "found.depth_spread / MOST_DEPTH_SPREAD) > 1.1"),
+        ("MOST_TOGETHER = 1.15", "MOST_TOGETHER = 1.2"),
         ("ENOUGH_POINTS = 50", "ENOUGH_POINTS = 40"),
         ("LEAST_COVER = 0.25", "LEAST_COVER = 0.2"),
         ("MOST_BEHIND = 0.05", "MOST_BEHIND = 0.1"),

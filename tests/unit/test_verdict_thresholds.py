@@ -57,9 +57,9 @@ TABLE = (
     ("pose.off-lines", {}, "epipolar_px", 3.9, 4.1),
     ("scale.uncertain", {}, "scale_spread", 0.095, 0.105),
     ("scale.uncertain", {"scale_spread": 0.2}, "points", 3, 2),
-    # .06^2 / .1^2 + .128^2 / .16^2 is 1.
-    ("pose.undetermined", {"scale_spread": 0.06}, "depth_spread", 0.127, 0.129),
-    ("pose.undetermined", {"depth_spread": 0.128}, "scale_spread", 0.059, 0.061),
+    # .069^2 / .1^2 + .1472^2 / .16^2 is 1.15^2.
+    ("pose.undetermined", {"scale_spread": 0.069}, "depth_spread", 0.146, 0.148),
+    ("pose.undetermined", {"depth_spread": 0.1472}, "scale_spread", 0.068, 0.070),
     ("pose.undetermined", {"depth_spread": 0.15}, "scale_spread", 0.11, 0.09),  # then it is the scale
     ("pose.undetermined", {"scale_spread": 0.09, "depth_spread": 0.15}, "points", 3, 2),
     ("prior.metres", {}, "prior_ratio", 1.85, 1.95),
