@@ -383,7 +383,7 @@ MUTANTS = [
         ("found.behind_infinity > USUAL_BEHIND", "found.behind_infinity > 0.0"),
         ("SCALE_SHARE = 0.75", "SCALE_SHARE = 0.7"),
         ("USUAL_SCALE = 0.06", "USUAL_SCALE = 0.08"),
-        ("SPREAD_SHARE = 0.5", "SPREAD_SHARE = 0.45"),
+        ("SPREAD_SHARE = 0.3", "SPREAD_SHARE = 0.25"),
         ("USUAL_SPREAD = 0.15", "USUAL_SPREAD = 0.13"),
         ("across_px * pixels_of_matches(size), behind_px", "across_px, behind_px"),
         ("abs(found.distortion) - USUAL", "found.distortion - USUAL"),

@@ -95,8 +95,8 @@ MOST_SHEAR = 0.005
 #: A refined pose whose scale is less certain than this is not trusted, unless known depths give the scale.
 MOST_SCALE_SPREAD = 0.1
 #: Nor is one whose scale and shape are within their limits, but together above this: the root of the sum of
-#: the squares of their shares of these. It was up to 1.10 for 50 pairs of trackers whose poses were refined, and
-#: 1.21 where the refinement hid that K was of an image .67 times as large.
+#: the squares of their shares of these. It was up to 1.10 for 50 pairs of trackers whose poses were refined,
+#: and 1.21 where the refinement hid that K was of an image .67 times as large.
 MOST_TOGETHER = 1.15
 #: Known depths that fix a scale and a shift, and show when one of them is wrong.
 LEAST_POINTS = 3

@@ -53,8 +53,8 @@ def view_at(*centre: float) -> CameraView:
         ({"scale_spread": 0.04}, SIZE, (0, 0, 0.03)),
         ({"scale_spread": 0.1}, SIZE, (0, 0, 0.08)),
         ({"scale_spread": math.inf}, SIZE, (0, 0, math.inf)),  # no point is in front of the cameras
-        # Half of the change by another pose counts, or what is beyond .15 if that is more.
-        ({"depth_spread": 0.1}, SIZE, (0, 0, 0.05)),
+        # Three tenths of the change by another pose count, or what is beyond .15 if that is more.
+        ({"depth_spread": 0.1}, SIZE, (0, 0, 0.03)),
         ({"depth_spread": 0.25}, SIZE, (0, 0, 0.2)),
         ({"scale_spread": 0.1, "depth_spread": 0.2}, SIZE, (0, 0, math.hypot(0.08, math.sqrt(0.0175)))),
         # Residuals are in pixels of a grid of 832 columns at most, what lies behind infinity in the image's.
