@@ -387,7 +387,7 @@ MUTANTS = [
         ("USUAL_SPREAD = 0.15", "USUAL_SPREAD = 0.13"),
         ("across_px * pixels_of_matches(size), behind_px", "across_px, behind_px"),
         ("abs(found.distortion) - USUAL", "found.distortion - USUAL"),
-        ("deviation**2 - usual**2", "(deviation - usual) ** 2"),
+        ("_known(deviation) ** 2 - usual**2", "(_known(deviation) - usual) ** 2"),
         ("math.hypot(MATCH_NOISE_PX, misfit.px)", "MATCH_NOISE_PX + misfit.px"),
         ("+ 2.0 * along)", "+ along)"),
         ("max(scale_spread, misfit.relative)", "math.hypot(scale_spread, misfit.relative)"),
