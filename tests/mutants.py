@@ -507,7 +507,7 @@ MUTANTS = [
         ("if differ and name in MAY_DIFFER", "if differ and False"),
         ("return in_units(rig, units or 1.0)", "return rig"),
         ('np.linalg.inv(pose) if R == "R" else pose', 'pose if R == "R" else np.linalg.inv(pose)'),
-        tests=("tests/contracts/test_formats.py",),
+        tests=("tests/contracts/test_formats.py", "tests/unit/test_named_calibrations.py"),
     ),
     *of(
         "formats/storage.py",
