@@ -61,9 +61,9 @@ def hidden_gaps(shift: np.ndarray, gaps: Gaps, infinity_px: float) -> np.ndarray
     """``(N,)`` bool: gaps between matches that a view to the right cannot see.
 
     A surface hides a strip of what is behind its left edge, and the strip is as wide as the shift of the near
-    surface exceeds that of the far one. A wider gap, or one without such a step, has another reason. So may a
-    gap near the left border, where the right view would not see the near surface either: this goes on there
-    unmatched, and what is matched beyond the gap is often chance.
+    surface exceeds that of the far one. A wider gap, or one without such a step, has another reason. So
+    may a gap have near the left border: where the right view would not see the near surface either, this may
+    go on unmatched, and what is matched beyond the gap is often chance.
 
     Args:
         shift: ``(H, W)`` pixels; it falls with depth.

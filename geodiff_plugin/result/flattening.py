@@ -5,7 +5,7 @@ it err alike, so a fit that follows them makes blotches of a wall. A plane in sp
 depth over the pixels: its slope is the same everywhere, which a smoothness of first order does not know.
 Smoothing in two steps, slopes and then values, after Bredies, Kunisch and Pock, Total Generalized Variation,
 SIAM J. Imaging Sci. 2010, here with squares, whose minimisers ``solve_field`` finds. The second step is
-taken on the grid of the matches and once more on that of the image, for what is finer than the first grid.
+taken on the grid of the matches and once more on that of the votes, for what is finer than the first grid.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SLOPE_SMOOTHNESS = 300.0
 SLOPES = 40.0
 #: Weight of a value where nothing is known, for a prior of ``WEAK_PRIOR`` or worse: it holds wide shapes.
 LEAST_VALUE_WEIGHT = 0.02
-#: The same on the grid of the image, where only detail of a few pixels is to go.
+#: The same on the grid of the votes, where only detail of a few pixels is to go.
 LEAST_DETAIL_WEIGHT = 0.5
 #: Step in log depth across which detail is not smoothed: less than ``DEPTH_EDGE``, so that edges stay sharp.
 DETAIL_EDGE = 0.03
@@ -43,7 +43,7 @@ WEAK_PRIOR = 0.1
 MOST_VALUE_WEIGHT = 1e3
 #: Conjugate-gradient steps on each grid of the solver's pyramid.
 STEPS = 8
-#: The inverse depth is never lowering below this share of itself.
+#: The inverse depth is never lowered below this share of itself.
 LEAST_SHARE = 0.3
 
 

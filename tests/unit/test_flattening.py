@@ -84,6 +84,24 @@ def test_blotches_of_a_slanted_wall_go_where_nothing_is_known_and_stay_where_all
     torch.testing.assert_close(kept, depth_m, rtol=2e-3, atol=0.0)
 
 
+@pytest.mark.parametrize(("deviation", "least", "most"), [(50.0, 0.0, 0.15), (1.0, 0.9, 1.0)])
+def test_specks_finer_than_the_grid_of_the_matches_go_where_nothing_is_known(
+    deviation: float, least: float, most: float
+) -> None:
+    """A plane on twice the grid of the matches, on which every 37th pixel is 2 % nearer."""
+    height, width = size = 2 * SIZE[0], 2 * SIZE[1]
+    rows, columns = torch.meshgrid(*(torch.arange(side).float() for side in size), indexing="ij")
+    plane = 0.3 + 0.001 * columns + 0.0005 * rows
+    speck = (torch.arange(height * width) % 37 == 0).view(size)
+    depth_m = (1.0 / (plane * (1.0 + 0.02 * speck)))[None, None]
+    flat_m = flatten(depth_m, matches_of(deviation), torch.full((1, 3, *size), 0.5), WEAK)
+    inverse = 1.0 / flat_m
+    around = torch.nn.functional.avg_pool2d(inverse, 5, 1, 2)[0, 0]  # 24 of 25 are no speck
+    inside = (slice(8, -8),) * 2
+    risen = (inverse[0, 0] / around - 1.0)[inside][speck[inside]].mean()
+    assert least <= risen / 0.02 <= most
+
+
 def test_a_plane_stays_a_plane_and_a_good_prior_keeps_its_relief() -> None:
     grey = torch.full((1, 3, *SIZE), 0.5)
     _, plane_m = slanted(0.0)
