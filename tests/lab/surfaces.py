@@ -36,7 +36,7 @@ from geodiff_plugin.result import finish
 from tests.lab.edges import surface_error
 
 __all__ = ["STAGES", "Flatness", "Stages", "draw_stages", "flatness", "guided_stages", "main"]
-__all__ += ["marked_planes", "of_polygon", "plane_of", "specks"]
+__all__ += ["marked_planes", "of_polygon", "plane_of", "relief", "specks"]
 
 #: What is measured, in the order of a call: key, heading.
 STAGES = {
@@ -228,7 +228,7 @@ def draw_stages(left: np.ndarray, stages: Stages, path: Path) -> None:
     for axis, (stage, values) in zip(axes.flat[1:], inverse.items(), strict=False):
         axis.imshow(values, vmin=low, vmax=high, cmap="turbo", interpolation="nearest")
         axis.set_title(STAGES[stage])
-    axes.flat[6].imshow(_relief(stages.of("result")), cmap="grey", vmin=0, vmax=1, interpolation="nearest")
+    axes.flat[6].imshow(relief(stages.of("result")), cmap="grey", vmin=0, vmax=1, interpolation="nearest")
     axes.flat[6].set_title("result, lit from the side")
     axes.flat[7].imshow(stages.of("confidence"), vmin=0, vmax=1, cmap="viridis")
     axes.flat[7].set_title("confidence")
@@ -243,7 +243,7 @@ def draw_stages(left: np.ndarray, stages: Stages, path: Path) -> None:
 RELIEF = 0.02
 
 
-def _relief(depth_m: np.ndarray) -> np.ndarray:
+def relief(depth_m: np.ndarray) -> np.ndarray:
     """``(H, W)`` in [0, 1]: the slope of log depth towards the lower right; a plane has an even grey."""
     down, across = np.gradient(np.log(depth_m))
     return np.clip(0.5 + (down + across) / (2.0 * RELIEF), 0.0, 1.0)

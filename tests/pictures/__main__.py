@@ -16,7 +16,7 @@ import typer
 from geodiff_plugin.cli.commands import APPEARANCE
 from tests.pictures.badges import write_badges
 from tests.pictures.charts import write_charts
-from tests.pictures.gallery import write_rendered, write_room, write_slider, write_tiles
+from tests.pictures.gallery import write_rendered, write_room, write_slider, write_tiles, write_walls
 from tests.pictures.mistaken import write_mistaken
 from tests.pictures.moving import write_moving
 from tests.pictures.notebook import write_notebook
@@ -27,6 +27,8 @@ IMAGES = Path("docs/images")
 MOVING = "toy"
 TILES = ("cycles", "toy", "desk")
 SLIDER = "toy"
+#: Rooms with plain walls.
+WALLS = ("bedroom_chair", "corridor", "cycles", "desk")
 
 app = typer.Typer(help="Make pictures of README and the documentation.", **APPEARANCE)
 Images = Annotated[Path, typer.Option(help="Folder for the pictures.")]
@@ -39,7 +41,7 @@ def rooms(
     ],
     images: Images = IMAGES,
 ) -> None:
-    """The moving picture, tiles, the gallery and the slider: real rooms, and rendered scenes with errors."""
+    """The moving picture, tiles, the gallery, the slider and walls: real rooms, and rendered scenes."""
     results = {room.name: solve(data, room) for room in ROOMS}
     write_moving(results[MOVING], room_named(MOVING), images / "moving.webp")
     write_tiles([(room_named(name), results[name]) for name in TILES], images / "rooms.webp")
@@ -47,6 +49,7 @@ def rooms(
     for room in ROOMS:
         write_room(room, results[room.name], images / "gallery" / f"{room.name}.webp")
     write_rendered(images / "gallery")
+    write_walls(data, WALLS, images / "walls.webp")
 
 
 @app.command()

@@ -13,9 +13,10 @@ from geodiff_plugin.evaluation.metrics import align
 from geodiff_plugin.formats.out import atomic_path
 from geodiff_plugin.jobs.report import single_map
 from geodiff_plugin.plotting import colour_depth, colour_share, depth_range, grid
+from tests.lab.surfaces import STAGES, guided_stages, relief
 from tests.pictures.moving import measured
 from tests.pictures.orbit import look_from, surface_of
-from tests.pictures.rooms import Room, RoomResult, call, guidance_of
+from tests.pictures.rooms import Room, RoomResult, call, guidance_of, prior, read_room
 from tests.scenes.dataset import find_synthetic, load_synthetic
 
 #: Width of a picture in a row of tiles, and of one in the gallery, pixels.
@@ -26,6 +27,8 @@ RENDERED = "synthetic:3@640x480"
 #: An error of this share of the depth has the lightest colour.
 LARGEST_ERROR = 0.2
 QUALITY = 82
+#: Stages whose surfaces are shown beside each other.
+WALL_STAGES = ("fit", "result")
 
 
 def save_webp(picture: Image.Image, path: Path) -> None:
@@ -70,6 +73,21 @@ def write_slider(result: RoomResult, folder: Path) -> None:
     fitted = align(result.prior, result.depth_m, np.ones_like(result.solid))
     for name, depth_m in (("prior", fitted), ("guided", result.depth_m)):
         save_webp(Image.fromarray(colour_depth(depth_m, near, far)), folder / f"{name}.webp")
+
+
+def write_walls(folder: Path, names: Sequence[str], path: Path) -> None:
+    """A row a room: photograph, depth, and how even surfaces are before the last stages and after them."""
+    pictures: list[np.ndarray] = []
+    for name in names:
+        left, right, rig = read_room(folder, name)
+        stages = guided_stages(prior(), (left, right), rig)
+        lit = [255.0 * relief(stages.of(stage)).round(3) for stage in WALL_STAGES]
+        greys = [np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2) for grey in lit]
+        pictures += [left, colour_depth(stages.of("result")), *greys]
+    lit_titles = [f"{STAGES[stage]}, lit from the side" for stage in WALL_STAGES]
+    titles = ["left image", "depth", *lit_titles] + [""] * (len(pictures) - 2 - len(WALL_STAGES))
+    columns = 2 + len(WALL_STAGES)
+    save_webp(grid(pictures, titles, columns=columns, cell_width=GALLERY_PX), path)
 
 
 def write_rendered(folder: Path) -> None:

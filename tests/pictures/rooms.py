@@ -86,7 +86,7 @@ def guidance_of(right: np.ndarray, rig: Rig) -> GeometryGuidance:
     return GeometryGuidance(Image.fromarray(right), (rig.K_left, rig.K_right), rig.E)
 
 
-def _read(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray, Rig]:
+def read_room(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray, Rig]:
     """Both pictures and their rig, cut to the rectangle that the cameras filled."""
     told, rig = json.loads((folder / CALIBRATION).read_text()), read_calibration(folder / CALIBRATION)
     x0, y0, x1, y1 = told["left_image_rect_normalized"]
@@ -104,7 +104,7 @@ def _read(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray, Rig]:
 
 def solve(folder: Path, room: Room) -> RoomResult:
     """A plain and a guided call on a pair of ``folder``, seed 0."""
-    left, right, rig = _read(folder, room.name)
+    left, right, rig = read_room(folder, room.name)
     out, plain = call(left, guidance_of(right, rig)), call(left, None)
     return RoomResult(
         left=left,
