@@ -35,6 +35,7 @@ LEAST_VALUE_WEIGHT = 0.02
 #: The same on the grid of the votes, where only detail of a few pixels is to go.
 LEAST_DETAIL_WEIGHT = 0.5
 #: Step in log depth across which detail is not smoothed: less than ``DEPTH_EDGE``, so that edges stay sharp.
+#: The map of a good prior has the same, as its small steps are no errors.
 DETAIL_EDGE = 0.03
 #: Error of a prior from which these weights are the least. They grow as the fourth power of a smaller error,
 #: as the stiffness of the fit does: the surfaces of a good prior need no smoothing.
@@ -63,7 +64,8 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor) ->
     of image and depth, the slopes ``s`` of ``q`` along either axis are smoothed to ``t = argmin sum g (k^2 +
     LEAST_SLOPE_WEIGHT) (t - s)^2 + SLOPE_SMOOTHNESS sum g |grad t|^2``. The result is ``q + e`` with ``e =
     argmin sum w e^2 + SLOPES sum g |grad (q + e) - t|^2`` and ``w = k^2 / (1 - k) + w_0``, where ``w_0`` is
-    ``LEAST_VALUE_WEIGHT`` of a weak prior, and more of a better one.
+    ``LEAST_VALUE_WEIGHT`` of a weak prior, and more of a better one. A step of ``DEPTH_EDGE`` in log depth is
+    an edge of a weak prior's map, and a smaller one, down to ``DETAIL_EDGE``, of a better one's.
 
     The map has detail finer than the grid of the matches: upsampling, sharpened edges and votes leave specks
     of a pixel or a few. So the second problem is solved once more, for ``q + e`` in place of ``q``, on the
@@ -81,7 +83,8 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor) ->
     """
     log_depth = depth_m.float().log()
     unit, good = log_depth.mean(), (WEAK_PRIOR / error).clamp_min(1.0) ** 4
-    surface = _surface(log_depth, target.size, left_01, unit)
+    edge = (DEPTH_EDGE / good.sqrt()).clamp_min(DETAIL_EDGE)
+    surface = _surface(log_depth, target.size, left_01, unit, edge)
     known = known_shape(target, torch.exp(-surface.log_depth))
     slopes, held = _smoothed(surface, known), _held(known)
     change = _towards(slopes, surface, held + LEAST_VALUE_WEIGHT * good)
@@ -103,12 +106,11 @@ def _on(x: Tensor, size: tuple[int, int], *, antialias: bool = False) -> Tensor:
 
 
 def _surface(
-    log_depth: Tensor, size: tuple[int, int], left_01: Tensor, unit: Tensor, edge: float = DEPTH_EDGE
+    log_depth: Tensor, size: tuple[int, int], left_01: Tensor, unit: Tensor, edge: Tensor | float
 ) -> _Surface:
     """A map on a grid, with links that fall to a third across a step of ``edge`` in log depth."""
     log_depth = _on(log_depth, size)
-    steps = log_depth if edge == DEPTH_EDGE else log_depth * (DEPTH_EDGE / edge)
-    links = edge_links(_on(left_01.float(), size, antialias=True), steps)
+    links = edge_links(_on(left_01.float(), size, antialias=True), log_depth * (DEPTH_EDGE / edge))
     return _Surface(log_depth, torch.exp(unit - log_depth), links)
 
 
