@@ -77,17 +77,15 @@ def write_slider(result: RoomResult, folder: Path) -> None:
 
 def write_walls(folder: Path, names: Sequence[str], path: Path) -> None:
     """A row a room: photograph, depth, and how even surfaces are before the last stages and after them."""
+    heads = ["left image", "depth", *(f"{STAGES[stage]}, lit from the side" for stage in WALL_STAGES)]
     pictures: list[np.ndarray] = []
     for name in names:
         left, right, rig = read_room(folder, name)
         stages = guided_stages(prior(), (left, right), rig)
-        lit = [255.0 * relief(stages.of(stage)).round(3) for stage in WALL_STAGES]
-        greys = [np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2) for grey in lit]
-        pictures += [left, colour_depth(stages.of("result")), *greys]
-    lit_titles = [f"{STAGES[stage]}, lit from the side" for stage in WALL_STAGES]
-    titles = ["left image", "depth", *lit_titles] + [""] * (len(pictures) - 2 - len(WALL_STAGES))
-    columns = 2 + len(WALL_STAGES)
-    save_webp(grid(pictures, titles, columns=columns, cell_width=GALLERY_PX), path)
+        lit = (relief(stages.of(stage)) for stage in WALL_STAGES)
+        pictures += [left, colour_depth(stages.of("result")), *lit]
+    titles = heads + [""] * (len(pictures) - len(heads))
+    save_webp(grid(pictures, titles, columns=len(heads), cell_width=GALLERY_PX), path)
 
 
 def write_rendered(folder: Path) -> None:
