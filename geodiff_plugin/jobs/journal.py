@@ -70,6 +70,14 @@ class Shard:
         """Its index on its own machine, by which it takes a GPU."""
         return int(os.environ.get("LOCAL_RANK", self.index))
 
+    def processes_here(self, gpus: int) -> int:
+        """How many processes of the job share this machine and its cores, >= 1.
+
+        ``torchrun`` says it in ``LOCAL_WORLD_SIZE``. Otherwise each is taken to have one of the ``gpus`` that
+        it sees to itself, so that there are no more processes than these.
+        """
+        return int(os.environ.get("LOCAL_WORLD_SIZE", max(1, min(self.count, gpus))))
+
     def part(self, items: Sequence[T]) -> list[T]:
         """The items of this shard."""
         return list(items[self.index :: self.count])

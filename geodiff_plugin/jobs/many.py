@@ -77,8 +77,9 @@ class Stages:
 
     A ``pipe`` that is not given is loaded when the first pair has been read; ``among`` stages compute at the
     same time and share the cores; ``tell`` hears which prior it is, and what was assumed. Beside a GPU
-    processes of their own write the ``pairs`` that there are: a thread that writes would keep the others,
-    which launch kernels, from Python's lock. They start at once, while the prior is loaded.
+    so many ``writers``, processes of their own, write the pairs: a thread that writes would keep the others,
+    which launch kernels, from Python's lock. They start at once, while the prior is loaded. Without any, as
+    on a CPU, a thread writes.
     """
 
     def __init__(
@@ -89,19 +90,18 @@ class Stages:
         *,
         among: int = 2,
         tell: Tell = silent,
-        pairs: int = MOST_WRITERS,
+        writers: int = 0,
     ) -> None:
         self._options, self._device, self._pipe = options, device, pipe
         self._among, self._tell = among, tell
         self._views, self._folders = Views(options), dict[str, ExitStack]()
-        count = _writers(device, pairs)
-        self._writers = SeparateProcesses(write_row.__module__, count) if count else None
+        self._writers = SeparateProcesses(write_row.__module__, writers) if writers else None
         #: The stages in their order.
         self.all: tuple[Stage, ...] = (
             self.read,
             self.evidence,
             self.guide,
-            SideBySide(self.write, max(1, count)),
+            SideBySide(self.write, max(1, writers)),
         )
 
     def close(self) -> None:
@@ -165,11 +165,14 @@ class Stages:
         self._folders.pop(item.key, ExitStack()).close()
 
 
-def _writers(device: torch.device, pairs: int) -> int:
-    """How many processes write so many pairs; none where the stages before need all cores."""
+def count_writers(device: torch.device, pairs: int, processes: int) -> int:
+    """How many processes write so many pairs; none where the stages before need all cores.
+
+    ``processes`` like this one share the cores of the machine.
+    """
     if not leaves_cpu_free(device):
         return 0
-    return min(pairs, MOST_WRITERS, max(1, available_cores() - CORES_OF_STAGES))
+    return min(pairs, MOST_WRITERS, max(1, available_cores() // processes - CORES_OF_STAGES))
 
 
 def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:
@@ -225,7 +228,9 @@ def depth_pairs(
             else:
                 runner = Runner(items, journal, noun="pair", survives=(Exception,), progress=progress)
                 left = sum(journal.get(item) is None for item in items)
-                records = _through(Stages(options, device, pipe, tell=tell, pairs=left), runner)
+                processes = shard.processes_here(torch.cuda.device_count())
+                writers = count_writers(device, left, processes)
+                records = _through(Stages(options, device, pipe, tell=tell, writers=writers), runner)
         rows = [_final(record, there.get(record["key"]), options, tell) for record in records]
         write_table(shard.path(options.out / SUMMARY), rows, tell)
         if options.steady:

@@ -22,7 +22,7 @@ from PIL import Image
 
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.jobs.journal import Item, Journal
-from geodiff_plugin.jobs.many import Stages
+from geodiff_plugin.jobs.many import Stages, count_writers
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import start_many
 from geodiff_plugin.jobs.prior import load_guided_prior
@@ -104,7 +104,9 @@ class ManyPairs:
         """
         among = 2 if shared else 1
         if among not in self._stages:
-            self._stages[among] = Stages(self._options, self._device, self._pipe, among=among)
+            writers = count_writers(self._device, len(self._refs), 1)
+            stages = Stages(self._options, self._device, self._pipe, among=among, writers=writers)
+            self._stages[among] = stages
         stages = self._stages[among]
         with tempfile.TemporaryDirectory() as folder:
             items = [Item(ref.name, ref) for ref in self._refs]

@@ -270,6 +270,25 @@ def test_a_shard_is_typed_or_told_by_the_launcher(monkeypatch, typed, environmen
     assert Shard.of(typed) == expected
 
 
+@pytest.mark.parametrize(
+    ("shard", "environment", "gpus", "processes"),
+    [
+        (Shard(3, 64), {"LOCAL_WORLD_SIZE": "8"}, 8, 8),
+        (Shard(3, 8), {}, 8, 8),  # typed, a process for each GPU of one machine
+        (Shard(3, 64), {}, 1, 1),  # a task of SLURM sees its own GPU only
+        (Shard(0, 1), {}, 8, 1),
+        (Shard(0, 2), {}, 0, 1),
+    ],
+)
+def test_processes_of_one_machine_are_told_by_torchrun_or_by_its_gpus(
+    monkeypatch, shard, environment, gpus, processes
+):
+    monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert shard.processes_here(gpus) == processes
+
+
 @pytest.mark.parametrize("typed", ["8/8", "1", "-1/3", "1/0", "a/b", ""])
 def test_what_is_no_shard_is_refused(typed):
     with pytest.raises(InputError, match="--shard must be I/N"):
