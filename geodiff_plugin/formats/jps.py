@@ -15,14 +15,15 @@ SUFFIXES = (".jps", ".pns")
 HEAD_BYTES = 65536
 #: Segment APP3 with its mark, the length of the block, and its bytes: separation, flags, layout, kind.
 SEGMENT = re.compile(rb"\xff\xe3..(?:_JPSJPS_)..(.)(.)(.)(.)", re.DOTALL)
+#: The kind of a picture with two views.
 STEREO = 1
-SIDE_BY_SIDE = 2
-#: What other layouts are, and what makes two pictures of them.
+#: What layouts other than 2, both views side by side, are called.
 OTHER_LAYOUTS = {
     1: "interleaved rows",
     3: "one view above the other",
     4: "an anaglyph, whose views have lost their colours",
 }
+#: The flag of a picture whose left half shows the left view.
 LEFT_FIRST = 4
 
 

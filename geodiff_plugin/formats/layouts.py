@@ -88,6 +88,24 @@ class CaptureFormat:
     has_poses: bool = True
 
 
+def largest_part_notes(noun: str, images: Sequence[int]) -> tuple[Message, ...]:
+    """What to say where a file has several parts, of which the first and largest is read.
+
+    Args:
+        noun: what the program that wrote the file calls a part.
+        images: how many images each part has, the largest number first; those without any count for nothing.
+    """
+    largest, *others = images
+    left_out = ", ".join(str(count) for count in others if count)
+    if not left_out:
+        return ()
+    sentence = (
+        f"The largest {noun}, of {largest} images, is used. Others are left out, as each has a frame of its "
+        f"own: those of {left_out} images."
+    )
+    return (Message("capture.part", sentence),)
+
+
 def build_frame(frame: CaptureFrame, build: Callable[[CaptureFrame], Candidate]) -> Candidate:
     """What ``build`` makes of a frame; what is wrong with its camera or pose leaves out this frame alone."""
     try:

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.formats.named import UNITS
 from geodiff_plugin.formats.rigs import Camera, CameraChoice, array_of, make_rig, transform
 from geodiff_plugin.types import Rig
 
 Entries = dict[str, Any]
-#: What MATLAB calls its units, and how many of them a metre has; millimetres are its default.
-MATLAB_UNITS = {"mm": 1e3, "millimeters": 1e3, "cm": 1e2, "centimeters": 1e2, "m": 1.0, "meters": 1.0}
+#: The unit of a file that names none, as in MATLAB itself.
+DEFAULT_UNIT = "mm"
 
 
 def _matlab_camera(entries: Entries) -> Camera:
@@ -41,8 +42,8 @@ def read_matlab(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         R, t = np.array(data["PoseCamera2"]["R"], float), data["PoseCamera2"]["Translation"]
     else:
         R, t = np.array(data["RotationOfCamera2"], float).T, data["TranslationOfCamera2"]
-    unit = str(data["CameraParameters1"].get("WorldUnits") or "mm").lower()
-    if unit not in MATLAB_UNITS:
-        bad_value("WorldUnits", f"one of {', '.join(MATLAB_UNITS)}", unit)
-    shift_m = array_of(t, (3,), "TranslationOfCamera2") / MATLAB_UNITS[unit]
+    unit = str(data["CameraParameters1"].get("WorldUnits") or DEFAULT_UNIT).lower()
+    if unit not in UNITS:
+        bad_value("WorldUnits", f"one of {', '.join(UNITS)}", unit)
+    shift_m = array_of(t, (3,), "TranslationOfCamera2") / UNITS[unit]
     return make_rig(left, right, np.linalg.inv(transform(R, shift_m, "RotationOfCamera2")))

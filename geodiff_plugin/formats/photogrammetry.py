@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from geodiff_plugin._checks import InputError, bad_value
 from geodiff_plugin.formats.files import parse_xml, read_text, stored_size
 from geodiff_plugin.formats.image_files import IMAGE_FOLDERS, files_of, image_folders
-from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout
+from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Images, Layout, largest_part_notes
 from geodiff_plugin.formats.rigs import Camera, array_of, central_camera, intrinsics, pose_of, rigid
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.messages import Message
@@ -95,7 +95,7 @@ def _metashape(file: Path, root: Element, images_at: Path | None) -> Layout:
     if not parts:
         cure = "Align the photos in Metashape, then export the cameras again."
         bad_value("PATH", "Metashape's cameras", f"{file} without a camera", cure)
-    part, others = parts[0], [str(other.placed()) for other in parts[1:] if other.placed()]
+    part = parts[0]
     sensors: dict[str | None, Camera | str] = {}
     for sensor in part.chunk.iter("sensor"):
         try:
@@ -118,12 +118,8 @@ def _metashape(file: Path, root: Element, images_at: Path | None) -> Layout:
         return Candidate(replace(frame, E=E), sensor)
 
     candidates = images.candidates(build, cameras)
-    notes = list(images.notes)
-    if others:
-        said = f"The chunk or component with most placed cameras, {part.placed()}, is used"
-        sentence = f"{said}; left out, since each has a frame of its own: those with {', '.join(others)}."
-        notes.append(Message("capture.part", sentence))
-    return Layout("Metashape", None if scale == 1.0 else "m", candidates, notes=tuple(notes))
+    notes = (*images.notes, *largest_part_notes("chunk or component", [each.placed() for each in parts]))
+    return Layout("Metashape", None if scale == 1.0 else "m", candidates, notes=notes)
 
 
 def _metashape_camera(sensor: Element) -> Camera:
@@ -169,7 +165,8 @@ def read_opensfm(path: Path, images_at: Path | None = None) -> Layout | None:
 
 
 def _opensfm(file: Path, data: list[Entries], images_at: Path | None) -> Layout:
-    part = max(data, key=lambda each: len(each["shots"]))
+    parts = sorted(data, key=lambda each: len(each["shots"]), reverse=True)
+    part = parts[0]
     shots = sorted(part["shots"].items())
     # Beside a model of undistorted images; those of the same names above it are the distorted ones.
     undistorted = file.parent.name == UNDISTORTED
@@ -183,11 +180,7 @@ def _opensfm(file: Path, data: list[Entries], images_at: Path | None) -> Layout:
         return Candidate(replace(frame, E=np.linalg.inv(T)), _opensfm_camera(part["cameras"][shot["camera"]]))
 
     candidates = images.candidates(build, (shot for _, shot in shots))
-    notes = list(images.notes)
-    if len(data) > 1:
-        sizes = ", ".join(str(len(each["shots"])) for each in data if each is not part)
-        sentence = f"The largest part, of {len(shots)} images, is used; left out: parts of {sizes}."
-        notes.append(Message("capture.part", sentence))
+    notes = [*images.notes, *largest_part_notes("part", [len(each["shots"]) for each in parts])]
     if (file.parent / "reference_lla.json").is_file():
         sentence = "Its lengths are metres as exact as its GPS: give --metres-per-unit 1 to take them."
         notes.append(Message("capture.gps-scale", sentence))

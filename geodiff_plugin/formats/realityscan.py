@@ -15,9 +15,8 @@ from pathlib import Path
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.files import parse_xml, read_text, stored_size
 from geodiff_plugin.formats.image_files import images_in
-from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Layout, build_frame
+from geodiff_plugin.formats.layouts import Candidate, CaptureFrame, Layout, build_frame, largest_part_notes
 from geodiff_plugin.formats.rigs import Camera, array_of, intrinsics, transform
-from geodiff_plugin.messages import Message
 
 NAMESPACE = "http://www.capturingreality.com/ns/xcr/1.1#"
 #: Millimetres of a film to which focal lengths are equivalent, along the longer side of the image.
@@ -58,13 +57,9 @@ def _entries(file: Path) -> Entries:
 
 
 def _realityscan(images: list[tuple[Path, Entries]]) -> Layout:
-    sizes = Counter(entries.get("ComponentId", "") for _, entries in images)
-    ((component, count), *others) = sizes.most_common()
-    notes: tuple[Message, ...] = ()
-    if others:
-        left_out = ", ".join(str(number) for _, number in others)
-        said = f"The largest component, of {count} images, is used; left out: components of {left_out}."
-        notes = (Message("capture.part", said),)
+    largest_first = Counter(entries.get("ComponentId", "") for _, entries in images).most_common()
+    component, _ = largest_first[0]
+    notes = largest_part_notes("component", [count for _, count in largest_first])
     candidates = [
         build_frame(CaptureFrame(image.stem, image), partial(_frame, entries=entries))
         for image, entries in images

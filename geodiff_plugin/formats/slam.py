@@ -25,17 +25,12 @@ from geodiff_plugin.formats.rigs import (
     rigid,
     two_cameras,
 )
-from geodiff_plugin.formats.storage import read_yaml
+from geodiff_plugin.formats.storage import read_yaml, without_sizes
 from geodiff_plugin.types import Rig
 
 Entries = dict[str, Any]
 #: AirSLAM's ``distortion_type``: OpenCV's model and how many of the five coefficients it has.
 AIRSLAM_LENSES = {0: ("opencv", 0), 1: ("opencv", 5), 2: ("fisheye", 4)}
-
-
-def _numbers(value: Any) -> Any:
-    """The numbers of a list, or of a matrix with rows, columns and data."""
-    return value["data"] if isinstance(value, dict) else value
 
 
 def read_okvis(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
@@ -61,7 +56,7 @@ def read_svo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     poses = []
     for n in pair:
         name = "T_B_C" if "T_B_C" in cameras[n] else "T_C_B"
-        pose = rigid(_numbers(cameras[n][name]), f"{name} of camera {n}")
+        pose = rigid(without_sizes(cameras[n][name]), f"{name} of camera {n}")
         poses.append(pose if name == "T_B_C" else np.linalg.inv(pose))
     left, right = (_svo_camera(cameras[n]["camera"]) for n in pair)
     return make_rig(left, right, np.linalg.inv(poses[0]) @ poses[1])
@@ -71,7 +66,8 @@ def _svo_camera(entries: Entries) -> Camera:
     model, lens = str(entries["type"]), entries["distortion"]
     model = str(lens["type"]) if model == "pinhole" else model  # of another one the lens is refused
     size = entries["image_width"], entries["image_height"]
-    return Camera(intrinsics(*_numbers(entries["intrinsics"])), size, _numbers(lens["parameters"]), model)
+    K = intrinsics(*without_sizes(entries["intrinsics"]))
+    return Camera(K, size, without_sizes(lens["parameters"]), model)
 
 
 def read_stella(texts: tuple[str, ...], choice: CameraChoice) -> Rig:

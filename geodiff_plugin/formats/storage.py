@@ -108,7 +108,7 @@ def read_storage(text: str) -> Entries:
     entries: Entries = {}
     unclear = set[str]()  # names that entries of several parts have, and none of them is the file's own
     for key, value, level in _flat(content, ""):
-        key, numbers = key.lower(), _numbers(value["data"] if _is_matrix(value) else value)
+        key, numbers = key.lower(), _numbers(without_sizes(value))
         value = value if numbers is None else numbers
         if level and key in entries and not np.array_equal(entries[key], value):
             unclear.add(key)
@@ -119,6 +119,11 @@ def read_storage(text: str) -> Entries:
 
 def _is_matrix(value: Any) -> bool:
     return isinstance(value, dict) and "data" in value
+
+
+def without_sizes(value: Any) -> Any:
+    """The ``data`` of a matrix that is written with its rows and columns; any other value as it is."""
+    return value["data"] if _is_matrix(value) else value
 
 
 #: What an outer name says of the camera: its side, or its number.

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from geodiff_plugin import GeometryGuidance, InputError
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.evidence.inputs import left_images
-from geodiff_plugin.formats import read_calibration
+from geodiff_plugin.formats import layouts, read_calibration
 from geodiff_plugin.formats.clouds import Cloud
 from geodiff_plugin.formats.colmap import MODELS, write_colmap
 from geodiff_plugin.formats.images import in_stored_pixels
@@ -438,6 +438,17 @@ def test_the_largest_of_several_models_is_taken_and_said(tmp_path):
         "To take another, give its folder."
     ]
     assert len(Capture.open(folder / "sparse" / "0")) == 2
+
+
+def test_what_is_left_out_beside_the_largest_part_of_a_file_is_said():
+    (note,) = layouts.largest_part_notes("component", [41, 12, 0, 3])
+    assert note.code == "capture.part"
+    assert note == (
+        "The largest component, of 41 images, is used. Others are left out, as each has a frame of its own: "
+        "those of 12, 3 images."
+    )
+    assert layouts.largest_part_notes("component", [41]) == ()
+    assert layouts.largest_part_notes("component", [41, 0]) == ()
 
 
 DEPTH_KINDS = [
