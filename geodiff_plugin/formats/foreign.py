@@ -23,6 +23,7 @@ class ForeignCalibration:
 
 
 ONE_CAMERA = "It is of one camera: give the stereo calibration, or K and E of the pair (--K, --K-right, --E)."
+OF_PAIR = "Give K of both, and as --E the right camera's pose in the left camera's frame, in metres."
 SAVE_NPZ = "In Python: np.savez('calib.npz', K1=K1, D1=D1, K2=K2, D2=D2, R=R, T=T) of its matrices."
 FOREIGN_CALIBRATIONS = (
     ForeignCalibration(
@@ -58,6 +59,41 @@ FOREIGN_CALIBRATIONS = (
         r"^Device info\s*:",
         "a RealSense without its calibration",
         "Give what rs-enumerate-devices -c prints.",
+    ),
+    ForeignCalibration(
+        r'\A\s*[\[{](?=[\s\S]*"transform")(?=[\s\S]*"intrinsics")[\s\S]*"distortion_model"',
+        "a rig of cuVSLAM (.edex)",
+        f"Rectify its images and give --fx --fy --cx --cy and --baseline. {OF_PAIR}",
+    ),
+    ForeignCalibration(
+        r'"CalibrationInformation"',
+        "the calibration of an Azure Kinect, whose colour and depth camera are no stereo pair",
+        "Give its colour image alone, with --K and the depth map as --points.",
+    ),
+    ForeignCalibration(
+        r'"calibDataSource"',
+        "cameras of the Panoptic Studio",
+        f"Its R and t are from the world to the camera, in centimetres. {OF_PAIR}",
+    ),
+    ForeignCalibration(
+        r'"extrinsic_r"',
+        "a camera of XRPrimer",
+        f"If world2cam is true, extrinsic_r and extrinsic_t are from the world to the camera. {OF_PAIR}",
+    ),
+    ForeignCalibration(
+        r'"camera_intrinsic"|\A\s*\{\s*"extrinsics"\s*:\s*\[\s*\{\s*"rotation"',
+        "cameras of a vehicle's frame (nuScenes, DGP)",
+        OF_PAIR,
+    ),
+    ForeignCalibration(
+        r"^fu\s*=[\s\S]*^u_direction\s*=",
+        "a camera of the Ames Stereo Pipeline (.tsai)",
+        f"Its R and C are from the camera to the world. {OF_PAIR}",
+    ),
+    ForeignCalibration(
+        r"\Ahttps?://\S+\s+\d+([ \t]+[-+.\deE]+){18}",
+        "a sequence of RealEstate10K",
+        "Write it as transforms.json: its fx fy cx cy are shares of the sides, its 3x4 from the world.",
     ),
     ForeignCalibration(
         r"\A# Bundle file|\ANVM_V3|<document[^>]*>\s*<chunk|\A\s*\[\s*\{[\s\S]*\"(shots|cameras)\"",

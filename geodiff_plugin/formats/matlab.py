@@ -1,23 +1,27 @@
-"""Calibrations that MATLAB writes: ``stereoParameters`` of its Computer Vision Toolbox, as JSON.
+"""Calibrations of MATLAB: ``stereoParameters`` of its Computer Vision Toolbox as JSON, Bouguet's toolbox.
 
-Source: its documentation.
+Source: their documentation.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.named import UNITS
-from geodiff_plugin.formats.rigs import Camera, CameraChoice, array_of, make_rig, transform
+from geodiff_plugin.formats.rigs import Camera, CameraChoice, array_of, intrinsics, make_rig, transform
 from geodiff_plugin.types import Rig
 
 Entries = dict[str, Any]
-#: The unit of a file that names none, as in MATLAB itself.
+#: The unit of a file that names none, as in MATLAB itself and in Bouguet's toolbox.
 DEFAULT_UNIT = "mm"
+#: Values of Bouguet's toolbox, as it prints them (behind a label) and as scripts assign them.
+BOUGUET = re.compile(r"(?m)^[ \t]*(?:[A-Za-z ]+:)?[ \t]*(\w+)[ \t]*=[ \t]*\[([^\]]*)\]")
 
 
 def _matlab_camera(entries: Entries) -> Camera:
@@ -47,3 +51,27 @@ def read_matlab(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         bad_value("WorldUnits", f"one of {', '.join(UNITS)}", unit)
     shift_m = array_of(t, (3,), "TranslationOfCamera2") / UNITS[unit]
     return make_rig(left, right, np.linalg.inv(transform(R, shift_m, "RotationOfCamera2")))
+
+
+def _bouguet_camera(values: Entries, side: str) -> Camera:
+    fx, fy = array_of(values[f"fc_{side}"], (2,), f"fc_{side}")
+    K = intrinsics(fx, fy, *array_of(values[f"cc_{side}"], (2,), f"cc_{side}"))
+    K[0, 1] = array_of(values.get(f"alpha_c_{side}", 0.0), (), f"alpha_c_{side}") * fx
+    return Camera(K, None, array_of(values[f"kc_{side}"], (5,), f"kc_{side}"))
+
+
+def read_bouguet(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
+    """Bouguet's toolbox, printed or as a script: ``x_right = rodrigues(om) x_left + T``, in millimetres.
+
+    Its pixels count from 0, and its ``kc`` has OpenCV's order.
+    """
+    values: Entries = {
+        name: re.split(r"[\s;,]+", words.strip(" ;,\t\n")) for name, words in BOUGUET.findall(texts[0])
+    }
+    left, right = (_bouguet_camera(values, side) for side in ("left", "right"))
+    if "R" in values:
+        R = array_of(values["R"], (3, 3), "R")
+    else:
+        R = Rotation.from_rotvec(array_of(values["om"], (3,), "om")).as_matrix()
+    shift_m = array_of(values["T"], (3,), "T") / UNITS[DEFAULT_UNIT]
+    return make_rig(left, right, np.linalg.inv(transform(R, shift_m, "om, T")))

@@ -211,7 +211,7 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     named = _named(arrays)
     sides = np.array([named[name].item() for name in SIDES if name in named])
     size = next((pair for pair in (named.get("image_size", sides), sides) if pair.size == 2), None)
-    if named.keys() >= {"P1", "P2"}:
+    if named.keys() >= {"P1", "P2"} and not any(_is_unused(named[name]) for name in ("P1", "P2")):
         rig = projected(named["P1"], named["P2"], size, size)
         if named.keys() >= {"M1", "M2", "D1", "D2"}:
             rig = _with_taken(rig, named, size)
@@ -223,6 +223,11 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         left, right = (Camera(_matrix(named[name], name), size, lens) for name, lens in lenses)
         rig = make_rig(left, right, _pose(named))
     return in_stated_unit(rig, {key: value for entries in read for key, value in entries.items()}, choice)
+
+
+def _is_unused(P: np.ndarray) -> bool:
+    """Whether a projection has no focal lengths: programs that do not rectify write 0 or 1 there."""
+    return bool(max(P[0], P[5]) <= 1)
 
 
 def _with_taken(rig: Rig, named: Entries, size: Any) -> Rig:
@@ -310,7 +315,8 @@ def _parallel(named: Entries, arrays: Arrays, size: Any) -> Rig:
     found = [named.get(name, named.get("M")) for name in ("M1", "M2")]
     Ks = [_matrix(K, "K") for K in found if K is not None]
     if len(Ks) != 2:
-        bad_value("the file", "a calibration with K1 and K2, or K, and a baseline", "no K1, K2")
+        cure = "It has a baseline, but no camera: give the file of the cameras beside it, or instead of it."
+        bad_value("the file", "a calibration with K1 and K2, or K, and a baseline", "no K1, K2", cure)
     of_each = "M" not in named or named.keys() & {"D1", "D2"}
     lenses = _lenses(arrays, named) if of_each else [named.get("D", ())] * 2
     left, right = (Camera(K, size, lens) for K, lens in zip(Ks, lenses, strict=True))

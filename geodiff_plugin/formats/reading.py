@@ -44,9 +44,9 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         "Middlebury or ETH3D calib.txt (cam0=[...])", r"^\s*cam0\s*=\s*\[", stereo.read_middlebury),
     "kitti_cam_to_cam": CalibrationFormat(
         "KITTI (P_rect_02: ...)", r"^\s*P_rect_\d+\s*:", stereo.read_kitti, uses_cameras=True),
-    # The number behind the colon keeps OpenCV's "P1: !!opencv-matrix" out.
+    # The number behind the colon keeps OpenCV's "P1: !!opencv-matrix" and lists of YAML out.
     "kitti_projections": CalibrationFormat(
-        "KITTI (P0: ...)", r"^\s*P[0-3]\s*:\s*[-+.\d]", stereo.read_kitti, uses_cameras=True),
+        "KITTI (P0: ...)", r"^\s*P[0-3][ \t]*:[ \t]*[-+.\d]", stereo.read_kitti, uses_cameras=True),
     "robotcar": CalibrationFormat(
         "pair of Oxford RobotCar's models (fx fy cx cy, and a 4x4)",
         rf"\A(?:\s*{_ROW}){{4}}\s*0(?:\.0*)?[ \t]+-?0(?:\.0*)?[ \t]+-?0(?:\.0*)?[ \t]+1(?:\.0*)?\s*\Z",
@@ -90,6 +90,16 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     "argoverse": CalibrationFormat(
         "Argoverse's calibration of its stereo pair (vehicle_SE3_camera_)",
         _JSON + r'(?=[\s\S]*"vehicle_SE3_camera_")', stereo.read_argoverse),
+    "bouguet": CalibrationFormat(
+        "Bouguet's calibration toolbox (fc_left, kc_left)", r"^[^%\n]*\bfc_left[ \t]*=[ \t]*\[",
+        matlab.read_bouguet),
+    "multical": CalibrationFormat(
+        "multical's calibration.json (cameras, camera_poses)",
+        _JSON + r'(?=[\s\S]*"cameras")(?=[\s\S]*"camera_poses")', multicamera.read_multical,
+        uses_cameras=True),
+    "mc_calib": CalibrationFormat(
+        "MC-Calib's calibrated_cameras_data.yml (camera_pose_matrix)", r"^[ \t]+camera_pose_matrix[ \t]*:",
+        multicamera.read_mc_calib, uses_cameras=True),
     "mrcal": CalibrationFormat(
         "pair of mrcal's .cameramodel (lensmodel)", r"['\"]lensmodel['\"]\s*:", multicamera.read_mrcal, (2,)),
     "anipose": CalibrationFormat(
@@ -101,7 +111,8 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         uses_cameras=True),
     "svo": CalibrationFormat(
         "rig of SVO or maplab (cameras, T_B_C)",
-        r"\A(?=[\s\S]*^cameras[ \t]*:)[\s\S]*^[ \t-]*T_(B_C|C_B)[ \t]*:", slam.read_svo, uses_cameras=True),
+        r"\A(?=[\s\S]*^[ \t-]*cameras[ \t]*:)[\s\S]*^[ \t-]*T_(B_C|C_B)[ \t]*:", slam.read_svo,
+        uses_cameras=True),
     "stella": CalibrationFormat(
         "settings of stella_vslam (Camera, focal_x_baseline)",
         r"\A(?=[\s\S]*^[ \t]+(setup|focal_x_baseline)[ \t]*:)[\s\S]*^Camera[ \t]*:[ \t]*(#.*)?$",

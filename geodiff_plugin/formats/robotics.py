@@ -41,8 +41,11 @@ ORB_RECTIFIED = {"Camera1": ("Stereo.b", ("Rectified",)), "Camera": ("Camera.bf"
 
 
 def _pinhole(entries: Entries, coefficients: str) -> Camera:
-    """A camera of Kalibr or EuRoC; ``coefficients`` names the entry with those of its lens."""
-    model = entries["camera_model"]  # of another one the lens is refused
+    """A camera of Kalibr or EuRoC; ``coefficients`` names the entry with those of its lens.
+
+    MINS, which has OpenVINS' chain, leaves ``camera_model`` out.
+    """
+    model = entries.get("camera_model", "pinhole")  # of another one the lens is refused
     model = str(entries["distortion_model"] if model == "pinhole" else model)
     return Camera(
         intrinsics(*entries["intrinsics"][-4:]), entries["resolution"], entries[coefficients], model
@@ -159,6 +162,8 @@ def read_euroc(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     return make_rig(left, right, np.linalg.inv(T_body_left) @ T_body_right)
 
 
+#: What to do with files that have no pose of one camera beside the other.
+ROS_ALONE = "These are of single cameras. Calibrate the pair (camera_calibration with two topics)."
 #: Names of a matrix in a file of ``camera_calibration``, and in the message as ROS 1 and ROS 2 print it.
 ROS_NAMES = {
     "P": ("projection_matrix", "P", "p"),
@@ -238,11 +243,12 @@ def _ini_entries(block: str) -> Entries:
 def _rig_of_infos(infos: list[Entries]) -> Rig:
     """The rectified images by ``P``, and the images as taken where the entries say so."""
     sizes = [_window_size(info) for info in infos]
+    if any(_of_ros(info, "P") is None for info in infos):
+        bad_value("projection_matrix", "in both files", "none", ROS_ALONE)
     rig = projected(*map(_projection, infos), *sizes)
     if not rig.E[:3, 3].any():
         expected = "-fx * baseline in the right camera's file"
-        cure = "These are of single cameras. Calibrate the pair (camera_calibration with two topics)."
-        bad_value("projection_matrix[0, 3]", expected, "the same in both", cure)
+        bad_value("projection_matrix[0, 3]", expected, "the same in both", ROS_ALONE)
     if not all(info.get("rectified", True) for info in infos):
         return _taken_by_ros(rig, infos, sizes).as_taken or rig
     with suppress(InputError, KeyError):  # a file of rectified images may leave out what they were

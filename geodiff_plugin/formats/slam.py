@@ -50,8 +50,13 @@ def _okvis_camera(entries: Entries) -> Camera:
 
 
 def read_svo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """A rig of SVO or maplab; ``T_B_C`` is a camera's pose in the body's frame, ``T_C_B`` its inverse."""
-    cameras = read_yaml(texts[0])["cameras"]
+    """A rig of SVO or maplab; ``T_B_C`` is a camera's pose in the body's frame, ``T_C_B`` its inverse.
+
+    maplab's files of all sensors list it among them.
+    """
+    content = read_yaml(texts[0])
+    rig = next((each for each in content.get("sensors", ()) if "cameras" in each), content)
+    cameras = rig["cameras"]
     pair = two_cameras(choice, range(len(cameras)), (0, 1))
     poses = []
     for n in pair:

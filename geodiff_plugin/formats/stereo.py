@@ -32,6 +32,8 @@ ENTRY = re.compile(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*?)[ \t]*$", re.MULTILINE)
 DOFFS_TOLERANCE_PX = 0.05
 #: A number by its name, as YAML, TOML and people write it.
 NAMED_NUMBER = re.compile(r"^[ \t]*(\w+)[ \t]*[:=][ \t]*([-+.\deE]+)[ \t]*(?:#.*)?$", re.MULTILINE)
+#: No stereo camera has a shorter baseline: people who copy the format write metres.
+LEAST_MIDDLEBURY_MM = 1.0
 PROJECTION = re.compile(r"(P_rect_|P)(\d+)")
 PAIRS = ((0, 1), (2, 3))
 #: Folder names of the benchmarks: image_2 and image_02, and colored_0 of KITTI 2012.
@@ -48,6 +50,8 @@ SCENEFLOW_CENTRE = (479.5, 269.5)
 SCENEFLOW_SIZE = (960, 540)
 #: Numbers of a camera of DROID-SLAM with distortion.
 COUNT_OF_DROID = 8
+#: How exactly the rotation of a pose that is written in rows of four is one.
+ROTATION_TOLERANCE = 1e-3
 #: Metres between the cameras of Spring, which its files do not say.
 SPRING_BASELINE_M = 0.065
 #: What the names of its left images, or of their folder, contain.
@@ -70,8 +74,11 @@ def read_middlebury(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
             warn(Message("calibration.doffs", sentence))
             K_right[0, 2] = cx
     size = entries.get("width"), entries.get("height")
-    baseline_m = float(entries["baseline"]) / MM_PER_METRE
-    return make_rig(Camera(K_left, size), Camera(K_right, size), baseline_m, rectified=True)
+    baseline_mm = array_of(entries["baseline"], (), "baseline")
+    if 0 < baseline_mm < LEAST_MIDDLEBURY_MM and choice.baseline_m is None:
+        cure = f"If it is in metres, give it as such: --baseline {baseline_mm:g} (baseline_m)."
+        bad_value("baseline", "millimetres", baseline_mm, cure)
+    return make_rig(Camera(K_left, size), Camera(K_right, size), baseline_mm / MM_PER_METRE, rectified=True)
 
 
 def read_foundation_stereo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
@@ -94,8 +101,12 @@ def read_stereodemo(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     size = data.get("width"), data.get("height")
     columns = ("cx", "cx") if "cx" in data else ("cx0", "cx1")
     left, right = (Camera(intrinsics(data["fx"], data["fy"], data[cx], data["cy"]), size) for cx in columns)
-    named = next((key for key in BASELINES if key in data), BASELINES[0])
-    return make_rig(left, right, data[named])
+    named = next((key for key in BASELINES if key in data), "")
+    baseline_m = data[named] if named else choice.baseline_m
+    if baseline_m is None:
+        cure = "Give the distance of the cameras, which must be parallel, in metres (--baseline, baseline_m)."
+        bad_value("the file", f"one with {' or '.join(BASELINES)}", "none", cure)
+    return make_rig(left, right, baseline_m)
 
 
 def read_cityscapes(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
@@ -113,6 +124,10 @@ def read_spring(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     images, by their names, stand 65 mm apart.
     """
     rows = array_of(texts[0].split(), (-1,), "fx fy cx cy").reshape(-1, 4)
+    turn = rows[:3, :3]
+    if len(rows) in (3, 4) and np.allclose(turn @ turn.T, np.eye(3), atol=ROTATION_TOLERANCE):
+        cure = "Give it as --E, and the matrix of the cameras as --K (--K-right): --E is the right camera's "
+        bad_value("the file", "a calibration", "a pose", f"{cure}pose in the left camera's frame.")
     left_image = str(choice.image_names[0]) if choice.image_names else ""
     if SPRING_NAME not in left_image and choice.baseline_m is None:
         named = zip(("fx", "fy", "cx", "cy"), rows[0], strict=True)

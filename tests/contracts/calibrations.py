@@ -101,6 +101,14 @@ def kalibr_cam_imu(rig: Drawn) -> tuple[str, ...]:
     return kalibr_openvins(rig, "T_cam_imu")
 
 
+def kalibr_mins(rig: Drawn) -> tuple[str, ...]:
+    """MINS' config_camera.yaml: OpenVINS' chain without models of cameras, below its own settings."""
+    chain = yaml.safe_load(kalibr_openvins(rig)[0].partition("\n")[2])
+    for camera in chain.values():
+        del camera["camera_model"]
+    return ("%YAML:1.0\n\ncam:\n  max_n: 2\n" + yaml.safe_dump(chain),)
+
+
 def basalt(rig: Drawn, kind: str = "pinhole-radtan8", keys: str = "k1 k2 p1 p2") -> tuple[str, ...]:
     poses, cameras = [], []
     for n, T in enumerate(rig.worlds):
@@ -269,6 +277,12 @@ def svo_fisheye(rig: Drawn) -> tuple[str, ...]:
     return svo(rig, model="equidistant")
 
 
+def svo_sensors(rig: Drawn) -> tuple[str, ...]:
+    """maplab's file of all sensors, of which one is the rig."""
+    ncamera = yaml.safe_load(svo(rig)[0]) | {"sensor_type": "NCAMERA", "topic": ""}
+    return (yaml.safe_dump({"sensors": [{"id": "a1", "sensor_type": "IMU"}, ncamera]}, sort_keys=False),)
+
+
 def stella(rig: Drawn) -> tuple[str, ...]:
     fx, fy, cx, cy = rig.numbers(0)
     camera = {
@@ -334,6 +348,65 @@ def anipose(rig: Drawn, fisheye: bool = False) -> tuple[str, ...]:
 
 def anipose_fisheye(rig: Drawn) -> tuple[str, ...]:
     return anipose(rig, fisheye=True)
+
+
+def anipose_caliscope(rig: Drawn) -> tuple[str, ...]:
+    """caliscope's camera_array.toml: a table of cameras, rotations of nine numbers."""
+    text = ""
+    for n, T in enumerate(rig.worlds):
+        text += f"[cameras.{n}]\ncam_id = {n}\nrotation_count = 0\nsize = {list(rig.size)}\n"
+        text += f"matrix = {rig.K[n].tolist()}\ndistortions = {rig.lenses[n]}\n"
+        text += f"translation = {T[:3, 3].tolist()}\nrotation = {T[:3, :3].tolist()}\n\n"
+    return (text,)
+
+
+def mc_calib(rig: Drawn, kind: int = 0) -> tuple[str, ...]:
+    """calibrated_cameras_data.yml: poses are those of the cameras in the frame of the first of a group."""
+    text = "%YAML:1.0\n---\nnb_camera: 2\n"
+    for n, T in enumerate(rig.worlds):
+        matrices = {"camera_matrix": rig.K[n], "distortion_vector": [rig.lenses[n]]}
+        body = storage(**matrices).partition("---\n")[2] + f"distortion_type: {kind}\ncamera_group: 0\n"
+        body += f"img_width: {rig.size[0]}\nimg_height: {rig.size[1]}\n"
+        body += storage(camera_pose_matrix=np.linalg.inv(T)).partition("---\n")[2]
+        text += f"camera_{n}:\n" + "".join(f"   {line}\n" for line in body.splitlines())
+    return (text,)
+
+
+def mc_calib_fisheye(rig: Drawn) -> tuple[str, ...]:
+    return mc_calib(rig, 1)
+
+
+def multical(rig: Drawn, relative: bool = False) -> tuple[str, ...]:
+    """calibration.json: world-to-camera, or with a master the pose of the other beside it."""
+    names = ("left_00123", "right_00124")
+    cameras = {
+        name: {"model": "standard", "image_size": list(rig.size), "K": K.tolist(), "dist": [lens]}
+        for name, K, lens in zip(names, rig.K, rig.lenses, strict=True)
+    }
+    Ts = (np.eye(4), rig.T) if relative else rig.worlds
+    keys = (names[0], f"{names[1]}_to_{names[0]}" if relative else names[1])
+    poses = {key: {"R": T[:3, :3].tolist(), "T": T[:3, 3].tolist()} for key, T in zip(keys, Ts, strict=True)}
+    return (json.dumps({"cameras": cameras, "image_sets": {"rgb": []}, "camera_poses": poses}, indent=2),)
+
+
+def multical_relative(rig: Drawn) -> tuple[str, ...]:
+    return multical(rig, relative=True)
+
+
+def bouguet(rig: Drawn) -> tuple[str, ...]:
+    """What the stereo part of Bouguet's toolbox prints, without its uncertainties."""
+    text = "Stereo calibration parameters after optimization:\n"
+    for n, side in enumerate(("left", "right")):
+        (fx, fy, cx, cy), lens = rig.numbers(n), [*rig.lenses[n], 0.0]
+        text += f"\nIntrinsic parameters of {side} camera:\n\n"
+        text += f"Focal Length:          fc_{side} = [ {words([fx, fy])} ]\n"
+        text += f"Principal point:       cc_{side} = [ {words([cx, cy])} ]\n"
+        text += f"Skew:             alpha_c_{side} = [ 0.00000 ]\n"
+        text += f"Distortion:            kc_{side} = [ {words(lens)} ]\n"
+    turn = Rotation.from_matrix(rig.T[:3, :3]).as_rotvec()
+    text += "\nExtrinsic parameters (position of right camera wrt left camera):\n\n"
+    text += f"Rotation vector:             om = [ {words(turn)} ]\n"
+    return (text + f"Translation vector:           T = [ {words(1000 * rig.T[:3, 3])} ]\n",)
 
 
 def mrcal(rig: Drawn) -> tuple[str, ...]:
@@ -577,7 +650,8 @@ ANY_POSE = (
     *(kalibr_fisheye, orb_slam_fisheye, kalibr_openvins, kalibr_cam_imu, basalt, basalt_fisheye),
     *(vins, vins_fisheye, matlab, matlab_pose, named, named_by_side),
     *(okvis, okvis_fisheye, svo, svo_inverse, svo_fisheye, airslam, airslam_fisheye),
-    *(anipose, anipose_fisheye, mrcal, stvo),
+    *(anipose, anipose_fisheye, anipose_caliscope, mrcal, stvo),
+    *(mc_calib, mc_calib_fisheye, multical, multical_relative, bouguet, svo_sensors, kalibr_mins),
 )
 RECTIFIED = (
     *(middlebury, middlebury_blanks, kitti_cam_to_cam, kitti_projections, booster, stereodemo, ros, ros_echo),

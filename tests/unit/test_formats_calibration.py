@@ -401,6 +401,43 @@ def test_calibrations_that_are_not_read_are_named_with_their_cure(reading, text,
         reading(text)
 
 
+def test_a_baseline_of_middlebury_in_metres_is_refused_unless_it_is_given(reading):
+    K = "[700 0 300; 0 700 200; 0 0 1]"
+    text = f"cam0={K}\ncam1={K}\ndoffs=0\nbaseline=0.0054\n"
+    with pytest.raises(InputError, match=r"millimetres.*--baseline 0\.0054"):
+        reading(text)
+    assert reading(text, baseline_m=0.0054).E[0, 3] == pytest.approx(0.0054)
+
+
+def test_one_camera_for_both_images_needs_only_the_baseline_that_is_given(reading):
+    rig = reading("fx: 700\nfy: 701\ncx: 320\ncy: 240\n", baseline_m=0.2)
+    assert rig.E[0, 3] == pytest.approx(0.2) and rig.K_left[1, 1] == 701
+
+
+@pytest.mark.parametrize(
+    "unused", [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0], [0] * 12], ids=["identity", "zeros"]
+)
+def test_projections_that_a_program_left_unused_are_not_read(reading, unused):
+    K = [[700, 0, 320], [0, 700, 240], [0, 0, 1]]
+    lenses = {"D1": [0.1, 0, 0, 0], "D2": [0, 0.1, 0, 0]}
+    pose = {"R": np.eye(3).tolist(), "T": [-0.12, 0, 0], "P1": unused, "P2": unused}
+    rig = reading(json.dumps({"K1": K, "K2": K} | lenses | pose), distorted=True)
+    np.testing.assert_allclose(rig.E[:3, 3], (0.12, 0, 0))
+    assert not rig.rectified and None not in rig.distortion
+
+
+def test_projections_as_lists_of_yaml_are_not_taken_for_those_of_kitti(reading):
+    P1, P2 = ([[700, 0, 320, x], [0, 700, 240, 0], [0, 0, 1, 0]] for x in (0, -84))
+    rig = reading(yaml.safe_dump({"P1": P1, "P2": P2}, default_flow_style=False))
+    assert rig.E[0, 3] == pytest.approx(0.12)
+
+
+def test_ros_files_of_single_cameras_without_projections_say_so(reading):
+    text = "image_width: 752\ncamera_matrix: {rows: 3, cols: 3, data: [1]}\ndistortion_model: plumb_bob\n"
+    with pytest.raises(InputError, match=r"projection_matrix.*single cameras\. Calibrate the pair"):
+        reading(text, text)
+
+
 def test_a_matrix_of_middlebury_may_have_commas(reading):
     K = "[700, 0, 300; 0, 700, 200; 0, 0, 1]"
     rig = reading(f"cam0={K}\ncam1={K}\ndoffs=0\nbaseline=80\n")
