@@ -395,7 +395,7 @@ def config_from_text(entries: Iterable[str], base: GuidanceConfig, name: str) ->
 
 
 def value_of(name: str, config: GuidanceConfig) -> Any:
-    """A knob's value, or that of ``weights.TERM``; automatic choices as they are settled with matches.
+    """A knob's value, or that of ``weights.TERM``; automatic choices as they are made with matches.
 
     ``InputError`` for no such knob, ``KeyError`` for no such term.
     """

@@ -804,7 +804,7 @@ MUTANTS = [
         tests=(f"{UNIT}known_points.py",),
     ),
     *of(
-        "algorithm/settling.py",
+        "algorithm/depth_range.py",
         ("(index == 0) | (index == len(candidates) - 1)", "(index == 0) | (index == len(candidates))"),
         tests=(f"{UNIT}algorithm.py",),
     ),

@@ -21,7 +21,7 @@ from geodiff_plugin.pose.bars import bar_share
 from geodiff_plugin.pose.lens import remaining_distortion
 from geodiff_plugin.pose.mistakes import exchangeable, find_mistake, pose_change
 from geodiff_plugin.pose.moving import moved_share
-from geodiff_plugin.pose.solve import is_rig, nearby_poses, settle_poses
+from geodiff_plugin.pose.solve import is_rig, nearby_poses, regularised_poses
 from geodiff_plugin.pose.tearing import find_tear
 from geodiff_plugin.pose.tracks import (
     FEWEST,
@@ -204,7 +204,7 @@ def _refined(misfit: _Misfit, report: PoseReport) -> CheckedViews:
     """
     rights, tracks, given = misfit.rights, misfit.tracks, misfit.given
     before = median_residuals(tracks, given)
-    Ts, free = settle_poses(tracks, given, misfit.near, before, misfit.rig)
+    Ts, free = regularised_poses(tracks, given, misfit.near, before, misfit.rig)
     after, worst = median_residuals(tracks, Ts), int(np.argmax(np.nan_to_num(before)))
     residual_px, matches = tuple(before.tolist()), tuple(map(float, tracks.seen.sum(1)))
     report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)

@@ -61,7 +61,7 @@ STAGES = (
     "  match_volume",
     "    aggregate",
     "  match_rows",
-    "Trajectory.settle_scale",
+    "Trajectory.find_scale",
     "  search_scale",
     "  fit_to_points",
     "  refine_to_matches",

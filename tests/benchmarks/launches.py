@@ -77,7 +77,7 @@ STAGES = (
     "match_volume",
     "inverse_pose_preferred",
     "reliable_matches",
-    "Trajectory.settle_scale",
+    "Trajectory.find_scale",
     "search_scale",
     "fit_to_points",
     "refine_to_matches",

@@ -136,7 +136,7 @@ def test_the_benchmark_of_a_gpu_runs_whole_at_a_tiny_size(tmp_path, capsys):
     ways = {row["way"]: row["ms"] for row in parts["full-size"]["rows"] if "way" in row}
     assert ways["guided"] > ways["plain"] > 0.0
     spent = {row["stage"].strip(): row["ms"] for row in parts["stages"]["rows"]}
-    assert 0.0 < spent["refine_to_matches"] < spent["Trajectory.settle_scale"]
+    assert 0.0 < spent["refine_to_matches"] < spent["Trajectory.find_scale"]
     printed = capsys.readouterr().out
     assert all(f"\n{name}: " in printed for name in gpu.PARTS)
 

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from geodiff_plugin.algorithm import correction, edges
 from geodiff_plugin.algorithm.correction import correction_target, fit_depth, off_edges
+from geodiff_plugin.algorithm.depth_range import search_one_number
 from geodiff_plugin.algorithm.edges import sharpen_edges
 from geodiff_plugin.algorithm.gradients import RULES, Adam, FiniteWatch, power_above, pull_back
 from geodiff_plugin.algorithm.schedule import count_steps, make_schedule
-from geodiff_plugin.algorithm.settling import search_one_number
 from geodiff_plugin.algorithm.solver import FieldSystem, RobustField, solve_field
 from geodiff_plugin.algorithm.terms import Given, Loss
 from geodiff_plugin.config import DEFAULT
