@@ -70,6 +70,14 @@ class _Fit(NamedTuple):
     median_px: float  # residual
 
 
+class _Undone(NamedTuple):
+    """Tracks and pose ``(4, 4)`` as they would be if a mistake had not been made."""
+
+    mistake: Message
+    tracks: Tracks
+    T: np.ndarray
+
+
 class _Candidate(NamedTuple):
     """A mistake that might explain the misfit."""
 
@@ -115,27 +123,29 @@ def _scaled_focal(factor: float) -> Message:
     )
 
 
-def _candidates(tracks: Tracks, T: np.ndarray) -> Iterator[tuple[Message, Tracks, np.ndarray]]:
-    """Every mistake, and the tracks and the pose as they would be without it."""
+def _undone(tracks: Tracks, T: np.ndarray) -> Iterator[_Undone]:
+    """The tracks and the pose ``T (4, 4)`` without each of the usual mistakes."""
     inverse = np.linalg.inv(T)
-    yield INVERSE, tracks, inverse
-    yield _OPENGL, tracks, OPENGL_FROM_OPENCV @ T @ OPENGL_FROM_OPENCV
-    yield _OPENGL_INVERSE, tracks, OPENGL_FROM_OPENCV @ inverse @ OPENGL_FROM_OPENCV
-    E, turned, mixed = inverse.copy(), inverse.copy(), inverse.copy()
-    turned[:3, :3] = E[:3, :3].T
-    yield _TRANSPOSED, tracks, np.linalg.inv(turned)
+    yield _Undone(INVERSE, tracks, inverse)
+    yield _Undone(_OPENGL, tracks, OPENGL_FROM_OPENCV @ T @ OPENGL_FROM_OPENCV)
+    yield _Undone(_OPENGL_INVERSE, tracks, OPENGL_FROM_OPENCV @ inverse @ OPENGL_FROM_OPENCV)
+    turned, mixed = inverse.copy(), inverse.copy()
+    turned[:3, :3] = inverse[:3, :3].T
+    yield _Undone(_TRANSPOSED, tracks, np.linalg.inv(turned))
     mixed[:3, 3] = T[:3, 3]
-    yield _KEPT_T, tracks, np.linalg.inv(mixed)
+    yield _Undone(_KEPT_T, tracks, np.linalg.inv(mixed))
     if not np.allclose(tracks.K_left, tracks.K_rights[0], rtol=0.02):
-        yield _K_SWAPPED, replace(tracks, K_left=tracks.K_rights[0], K_rights=tracks.K_left[None]), T
+        swapped = replace(tracks, K_left=tracks.K_rights[0], K_rights=tracks.K_left[None])
+        yield _Undone(_K_SWAPPED, swapped, T)
     for factor in _FACTORS:
         Ks = np.stack([tracks.K_left, *tracks.K_rights])
         Ks[:, :2, :2] *= factor
         focal = replace(tracks, K_left=Ks[0], K_rights=Ks[1:])
         Ks = Ks.copy()
         Ks[:, :2, 2] = (Ks[:, :2, 2] + 0.5) * factor - 0.5
-        yield _scaled_K(factor), replace(tracks, K_left=Ks[0], K_rights=Ks[1:]), T
-        yield _scaled_focal(factor), focal, T
+        scaled = replace(tracks, K_left=Ks[0], K_rights=Ks[1:])
+        yield _Undone(_scaled_K(factor), scaled, T)
+        yield _Undone(_scaled_focal(factor), focal, T)
 
 
 def pose_change(given: np.ndarray, Ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -149,10 +159,10 @@ def pose_change(given: np.ndarray, Ts: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def _likeliest(tracks: Tracks, T: np.ndarray) -> _Candidate:
     """The mistake with the largest share of matches; among similar ones that with the best fine fit."""
     candidates = []
-    for mistake, changed, pose in _candidates(tracks, T):
-        (turned_deg,), (shift,) = pose_change(T[None], pose[None])
-        far = changed is not tracks or turned_deg >= _FAR_DEG or shift >= _FAR_SHIFT
-        candidates.append(_Candidate(mistake, _fit(changed, pose), bool(far)))
+    for each in _undone(tracks, T):
+        (turned_deg,), (shift,) = pose_change(T[None], each.T[None])
+        far = each.tracks is not tracks or turned_deg >= _FAR_DEG or shift >= _FAR_SHIFT
+        candidates.append(_Candidate(each.mistake, _fit(each.tracks, each.T), bool(far)))
     for level in range(len(_NEAR_PX)):
         largest = max(each.fit.shares[level] for each in candidates)
         candidates = [each for each in candidates if each.fit.shares[level] >= _ALIKE * largest]

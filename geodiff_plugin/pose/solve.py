@@ -101,6 +101,14 @@ def _jacobian(at: Projected, inverse_depth: np.ndarray) -> np.ndarray:
     return np.concatenate([at.by_point @ by_turn, at.by_point * inverse_depth[:, None, None]], axis=2)
 
 
+class _Observed(NamedTuple):
+    """The observations of tracks under some poses and inverse depths."""
+
+    weights: np.ndarray  # (V, N) robust
+    residuals: np.ndarray  # (V, N, 2) pixels
+    projected: list[Projected]  # where the tracks fall in each right view
+
+
 class _Whitened(NamedTuple):
     """Residuals of tracks and their derivatives, each times the root of its robust weight; n = 2 V."""
 
@@ -117,8 +125,8 @@ def _whitened(tracks: Tracks, Ts: np.ndarray, scale_px: float) -> _Whitened:
     views = len(Ts)
     w = solve_inverse_depth(tracks, Ts)
     for _ in range(2 if views > 1 else 0):
-        w = solve_inverse_depth(tracks, Ts, _weights(tracks, Ts, w, scale_px)[0])
-    weights, offs, ats = _weights(tracks, Ts, w, scale_px)
+        w = solve_inverse_depth(tracks, Ts, _observed(tracks, Ts, w, scale_px).weights)
+    weights, offs, ats = _observed(tracks, Ts, w, scale_px)
     by_pose = np.zeros((len(tracks), views, 2, 6 * views))
     by_depth = np.zeros((len(tracks), views, 2))
     for v, at in enumerate(ats):
@@ -135,20 +143,23 @@ def _whitened(tracks: Tracks, Ts: np.ndarray, scale_px: float) -> _Whitened:
     return _Whitened(float(cost), w, r, left_by_pose, depth_by_pose, slopes)
 
 
-def _weights(
-    tracks: Tracks, Ts: np.ndarray, w: np.ndarray, scale: float
-) -> tuple[np.ndarray, np.ndarray, list[Projected]]:
-    """Robust weights ``(V, N)`` of the observations, their residuals ``(V, N, 2)`` and where they fall."""
+def _observed(tracks: Tracks, Ts: np.ndarray, w: np.ndarray, scale: float) -> _Observed:
+    """The observations of tracks of inverse depth ``w (N,)``; ``scale`` in pixels is that of the weights."""
     ats = [project_tracks(tracks.rays, w, K, T) for K, T in zip(tracks.K_rights, Ts, strict=True)]
     offs = np.stack([at.px - px for at, px in zip(ats, tracks.right_px, strict=True)])
     weights = tracks.seen / (scale**2 + (offs**2).sum(-1))
-    return weights, offs, ats
+    return _Observed(weights, offs, ats)
 
 
 def _prior_terms(
     tracks: Tracks, Ts: np.ndarray, given: np.ndarray, w: np.ndarray, prior: PosePrior
 ) -> _Terms:
-    """Cost, gradient and normal matrix of the prior."""
+    """``sum_v |m_v|^2 / (n_v moved_px^2) + |r_v|^2 + |s_v|^2 + l_v^2``, its gradient and normal matrix.
+
+    ``m_v`` are the moves in pixels of the ``n_v`` tracks of inverse depth ``w`` that view ``v`` sees, ``r_v``
+    the turn from the given pose, ``s_v`` the shift, and ``l_v`` the log of the ratio of the baselines, the
+    last three each over its standard deviation in ``prior``.
+    """
     size = 6 * len(Ts)
     cost, gradient, normal = 0.0, np.zeros(size), np.zeros((size, size))
     for v, (T, T_given) in enumerate(zip(Ts, given, strict=True)):
@@ -182,6 +193,10 @@ def solve_poses(
 ) -> np.ndarray:
     """The poses ``(V, 4, 4)`` that fit the tracks of V right views best under the prior.
 
+    They minimise ``trust sum log(1 + r^2 / scale_px^2)`` over the residuals ``r`` of the tracks, each at the
+    inverse depth that fits it best, plus the cost of the prior (``_prior_terms``), by ``_STEPS`` damped steps
+    of Gauss and Newton (Levenberg 1944; Marquardt 1963).
+
     ``given (V, 4, 4)``, ``T_right_from_left``, is the middle of the prior, ``start`` where to begin if not
     there; from a residual of ``scale_px``, pixels of the right view, an observation counts for less; the
     residuals count ``trust``, (0, 1], against the prior (``tracks.split_residuals``).
@@ -199,17 +214,18 @@ def solve_poses(
             trust * normal + held.normal,
         )
 
-    damping, (cost, gradient, normal) = 1e-3, terms(Ts)
+    damping, now = 1e-3, terms(Ts)
     for _ in range(_STEPS):
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
+        damped = now.normal + damping * np.diag(np.diag(now.normal))
+        step = np.linalg.solve(damped, -now.gradient)
         tried = np.stack([_turned(T, step[6 * v : 6 * v + 6]) for v, T in enumerate(Ts)])
         new = terms(tried)
-        if new.cost >= cost:
+        if new.cost >= now.cost:
             damping *= 8.0
             continue
-        settled = cost - new.cost < 1e-6 * max(cost, 1.0)
-        Ts, (cost, gradient, normal), damping = tried, new, damping * 0.2
-        if settled:
+        converged = now.cost - new.cost < 1e-6 * max(now.cost, 1.0)
+        Ts, now, damping = tried, new, damping * 0.2
+        if converged:
             break
     return Ts
 
@@ -229,7 +245,7 @@ def nearby_poses(sparse: Tracks, given: np.ndarray, before: np.ndarray) -> np.nd
     return Ts
 
 
-def settle_poses(
+def regularised_poses(
     tracks: Tracks, given: np.ndarray, near: np.ndarray, before: np.ndarray, rig: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses that fit all matches; the better the given ones fit, the nearer to them.
@@ -248,19 +264,19 @@ def settle_poses(
     explained = np.sqrt(np.clip(before**2 - left**2, 0.0, None))
     views = [tracks.view(v) for v in range(len(given))]
     parts = [split_residuals(view, T) if len(view) else None for view, T in zip(views, fitted, strict=True)]
-    faults = np.array([np.nan if part is None else part[1] for part in parts])
+    faults = np.array([np.nan if part is None else part.faults_px for part in parts])
     times = explained / (_FAULTS * np.maximum(faults, _LEAST_FAULT_PX))
     share = np.full_like(times, _RIG_MOVED_SHARE) if rig else np.clip(times**4, *_MOVED_SHARE)
     moved = np.maximum(np.nan_to_num(share * explained), _FLOOR_PX)
-    counting = float(np.mean([part[0] for part in parts if part is not None]))
+    counting = float(np.mean([part.trust for part in parts if part is not None]))
     held = PosePrior(moved, _RIG_TURNED_RAD, _RIG_SHIFTED_SHARE) if rig else PosePrior(moved)
     wrong = not rig and bool((times > 1.0).any())
-    settled = fitted
+    Ts = fitted
     for by in (_SCALE_BY, *(_NARROWER_BY if wrong else ())):
         scale_px = max(by * float(np.nanmean(left)), _LEAST_SCALE_PX)
         how = {"scale_px": scale_px, "trust": _COUNTS * counting}
-        settled = solve_poses(tracks, given, held, start=settled, **how)
-    return settled, fitted
+        Ts = solve_poses(tracks, given, held, start=Ts, **how)
+    return Ts, fitted
 
 
 def depth_spread(tracks: Tracks, Ts: np.ndarray) -> float:

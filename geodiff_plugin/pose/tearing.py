@@ -6,6 +6,7 @@ A part of a picture that is moved along the rows leaves matches on their epipola
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -41,8 +42,16 @@ MOST_TEARS = 4
 EDGE = 4
 
 
-def _tears(grey: np.ndarray) -> list[tuple[float, int, int]]:
-    """Gain, row and shift of every tear of a grey image ``(H, W)`` uint8, the clearest first."""
+class _TornRow(NamedTuple):
+    """A row from which on a picture is moved; tears are sorted by their fields in this order."""
+
+    gain: float  # how many times as alike the rows are with the shift
+    row: int
+    shift: int  # pixels to the right
+
+
+def _tears(grey: np.ndarray) -> list[_TornRow]:
+    """Every tear of a grey image ``(H, W)`` uint8, the clearest first."""
     if len(grey) < 2 * EDGE + 2:
         return []
     rows = _sums(cv2.absdiff(grey[1:], grey[:-1])) / np.float32(grey.shape[1])  # (H - 1,) from row to row
@@ -56,7 +65,7 @@ def _tears(grey: np.ndarray) -> list[tuple[float, int, int]]:
             break
         gain, shift = _shift(grey[row], grey[row + 1])
         if gain > GAIN and abs(shift) >= LEAST_SHIFT_PX:
-            found.append((min(gain, float(steep[row])), int(row) + 1, shift))
+            found.append(_TornRow(min(gain, float(steep[row])), int(row) + 1, shift))
     return sorted(found, reverse=True)
 
 
@@ -100,6 +109,5 @@ def find_tear(greys: Sequence[np.ndarray], heights: Sequence[int]) -> Tear | Non
     if len(torn) != 1 or any(len(tears) > MOST_TEARS for tears in found):
         return None
     view = torn[0]
-    _, row, shift = found[view][0]
-    factor = heights[view] / len(greys[view])
-    return Tear(view, round(row * factor), round(shift * factor))
+    clearest, factor = found[view][0], heights[view] / len(greys[view])
+    return Tear(view, round(clearest.row * factor), round(clearest.shift * factor))

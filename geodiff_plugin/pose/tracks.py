@@ -264,11 +264,19 @@ def behind_infinity(tracks: Tracks, Ts: np.ndarray) -> Behind:
     return Behind(float((every_px > 0).mean()), float(np.quantile(every_px, _FARTHEST_BEHIND)))
 
 
-def split_residuals(tracks: Tracks, T: np.ndarray) -> tuple[float, float]:
-    """Weight of a match, (0, 1], and standard deviation of the error that neighbours share, pixels.
+class SharedErrors(NamedTuple):
+    """What neighbouring matches have in common, of one right view."""
 
-    Errors that no pose explains (rolling shutter, lens distortion, K) are shared by neighbours; then many
-    matches determine a pose no better than a few. The means of blocks of the image show them: the mean of
+    trust: float  # (0, 1], weight of a match, less where neighbours repeat each other's error
+    faults_px: float  # standard deviation of the error that they share, pixels
+
+
+def split_residuals(tracks: Tracks, T: np.ndarray) -> SharedErrors:
+    """Split the residuals of matches into noise of their own and errors that neighbours share.
+
+    Such errors
+    are those that no pose explains (rolling shutter, lens distortion, K); with them many matches determine a
+    pose no better than a few. The means of blocks of the image show them: the mean of
     ``n`` independent residuals has ``1 / n`` of their variance. ``T (4, 4)`` fits tracks of one right view.
     """
     off = epipolar(tracks, T).off_px
@@ -285,7 +293,7 @@ def split_residuals(tracks: Tracks, T: np.ndarray) -> tuple[float, float]:
     if len(count) >= _FEWEST_BLOCKS:
         between = (mean**2).mean()
         common = between - max(total - between, 0.0) * (1.0 / count).mean()
-    return float(1.0 / max(inflated, 1.0)), float(max(common, 0.0) ** 0.5)
+    return SharedErrors(float(1.0 / max(inflated, 1.0)), float(max(common, 0.0) ** 0.5))
 
 
 def grey_image(image_01: Tensor, K_image: Tensor, factor: float) -> GreyImage:

@@ -18,10 +18,10 @@ from geodiff_plugin.matching.planes import Parallax
 from geodiff_plugin.pose import refine
 from geodiff_plugin.pose import tracks as tracks_module
 from geodiff_plugin.pose.lens import remaining_distortion, undistorted_rays
-from geodiff_plugin.pose.mistakes import _candidates, exchangeable, find_mistake
+from geodiff_plugin.pose.mistakes import _undone, exchangeable, find_mistake
 from geodiff_plugin.pose.moving import moved_share
 from geodiff_plugin.pose.refine import depths_apart, fit_displacement, straightened
-from geodiff_plugin.pose.solve import PosePrior, is_rig, settle_poses, solve_poses
+from geodiff_plugin.pose.solve import PosePrior, is_rig, regularised_poses, solve_poses
 from geodiff_plugin.pose.tracks import (
     Tracks,
     _dense_matches,
@@ -124,9 +124,9 @@ def test_a_perturbed_pose_comes_back_but_for_what_the_views_cannot_tell() -> Non
     assert np.linalg.norm(solved[:3, 3]) == pytest.approx(np.linalg.norm(longer[:3, 3]), rel=0.01)
 
 
-def settled(tracks: Tracks, given: np.ndarray) -> np.ndarray:
+def regularised(tracks: Tracks, given: np.ndarray) -> np.ndarray:
     before, rig = median_residuals(tracks, given), is_rig(tracks, given)
-    return settle_poses(tracks, given, given, before, rig)[0]
+    return regularised_poses(tracks, given, given, before, rig)[0]
 
 
 def test_a_shift_that_makes_up_for_a_turn_comes_back() -> None:
@@ -136,7 +136,8 @@ def test_a_shift_that_makes_up_for_a_turn_comes_back() -> None:
     wrong[:3, 3] *= np.linalg.norm(TRUE[:3, 3]) / np.linalg.norm(wrong[:3, 3])
     given = np.linalg.inv(wrong)[None]
     assert np.median(residuals_px(tracks, given)) < 1.0
-    assert depth_error(tracks, settled(tracks, given), depth_m) < 0.5 * depth_error(tracks, given, depth_m)
+    found = regularised(tracks, given)
+    assert depth_error(tracks, found, depth_m) < 0.5 * depth_error(tracks, given, depth_m)
     assert depths_apart(tracks, Ts, Ts) == 0.0
     longer = Ts.copy()
     longer[:, :3, 3] *= 1.2
@@ -229,8 +230,8 @@ def test_a_mistake_is_named(true, given, K_given, words: str) -> None:
 def test_k_of_another_size_keeps_the_corner_of_the_first_pixel() -> None:
     """As the cure says, with the centre of that pixel at 0: each ray goes to ``(u + 0.5) * s - 0.5``."""
     tracks, Ts, _ = make_tracks([TRUE], count=10)
-    candidates = list(_candidates(tracks, Ts[0]))
-    scaled = [each.K_left for said, each, _ in candidates if said.code == "camera.scaled"]
+    undone = list(_undone(tracks, Ts[0]))
+    scaled = [each.tracks.K_left for each in undone if each.mistake.code == "camera.scaled"]
     assert len(scaled) >= 6
     for K_scaled in scaled:
         factor, rays = K_scaled[0, 0] / K[0, 0], tracks.rays @ K_scaled.T
