@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -50,6 +50,14 @@ DEFAULTS: dict[str, dict[str, Any]] = {
 }
 
 
+class _Grid(NamedTuple):
+    """What an image becomes before a network, in the order of the steps."""
+
+    reflected: tuple[int, int]  # rows and columns that are reflected at each side
+    size: tuple[int, int]  # (h, w) that it is then resized to
+    zeros: list[int]  # pixels of zeros to the left, right, top and bottom of that
+
+
 class Preparation:
     """Resizing, padding and normalisation of one checkpoint, by the contents of its file."""
 
@@ -69,8 +77,7 @@ class Preparation:
         if size is not None and not isinstance(size, int) and not {"height", "width"} <= set(size):
             bad_value(f"size {file}", "a number or a height and a width", size)
 
-    def _grid(self, height: int, width: int) -> tuple[tuple[int, int], tuple[int, int], list[int]]:
-        """Rows and columns that ZoeDepth reflects at each side; ``(h, w)`` then; zeros left to bottom."""
+    def _grid(self, height: int, width: int) -> _Grid:
         options, rows, columns = self.options, 0, 0
         if self.kind == "ZoeDepth" and options["do_pad"]:
             rows, columns = int((height / 2) ** 0.5 * 3), int((width / 2) ** 0.5 * 3)
@@ -79,7 +86,7 @@ class Preparation:
         if self.kind in PADDED_LAST and options["do_pad"] and divisor:
             missing = -w % divisor, -h % divisor
             zeros = [part for n in missing for part in (n // 2, n - n // 2)]
-        return (rows, columns), (h, w), zeros
+        return _Grid((rows, columns), (h, w), zeros)
 
     def _resized(self, height: int, width: int) -> tuple[int, int]:
         if not self.options["do_resize"]:

@@ -27,13 +27,41 @@ from geodiff_plugin.runtime.hooks import DenoiserTap, put_channels
 FULL = "full"
 #: Value of the knob for the tiny autoencoder that is published for its latent.
 TINY = "tiny"
-#: Channels, pixels per cell and scaling factor of a latent -> hub id of the tiny autoencoder for it.
-KNOWN: dict[tuple[Any, ...], str] = {
-    (4, 8, 0.18215): "madebyollin/taesd",
-    (4, 8, 0.13025): "madebyollin/taesdxl",
-    (16, 8, 1.5305): "madebyollin/taesd3",
-    (16, 8, 0.3611): "madebyollin/taef1",
-}
+
+
+class LatentGrid(NamedTuple):
+    """The latent of an autoencoder; ``None`` where its config does not say."""
+
+    channels: int | None
+    cell_px: int | None  # pixels of the image per cell, along a side
+
+    @classmethod
+    def of(cls, vae: Any) -> LatentGrid:
+        """Of an autoencoder of diffusers."""
+        config = vae.config
+        stages = config.get("decoder_block_out_channels") or config.get("block_out_channels")
+        channels = config.get("latent_channels", config.get("z_dim"))
+        return cls(channels, 2 ** (len(stages) - 1) if stages else None)
+
+    def __str__(self) -> str:
+        return f"{self.channels} channels, {self.cell_px} px a cell"
+
+
+class TinyAutoencoder(NamedTuple):
+    """A tiny autoencoder that is published, and the latent that it stands in for."""
+
+    latent: LatentGrid
+    scaling_factor: float
+    hub_id: str
+
+
+#: The tiny autoencoders of Stable Diffusion 1 and 2, XL and 3, and of FLUX.
+PUBLISHED = (
+    TinyAutoencoder(LatentGrid(4, 8), 0.18215, "madebyollin/taesd"),
+    TinyAutoencoder(LatentGrid(4, 8), 0.13025, "madebyollin/taesdxl"),
+    TinyAutoencoder(LatentGrid(16, 8), 1.5305, "madebyollin/taesd3"),
+    TinyAutoencoder(LatentGrid(16, 8), 0.3611, "madebyollin/taef1"),
+)
 
 
 class StepInputs(NamedTuple):
@@ -106,32 +134,33 @@ class MapCodec:
             return self.prior.encode(self.grid.padded(x))
 
 
-def _latent_of(vae: Any) -> tuple[int | None, int | None]:
-    """Channels of an autoencoder's latent, and pixels per cell; ``None`` if its config has none."""
-    config = vae.config
-    stages = config.get("decoder_block_out_channels") or config.get("block_out_channels")
-    return config.get("latent_channels", config.get("z_dim")), 2 ** (len(stages) - 1) if stages else None
-
-
 def tiny_autoencoder(pipe: Any, decoder: str) -> AutoencoderTiny | None:
     """The autoencoder that ``decoder`` of ``GuidanceConfig`` names, frozen; ``None`` for the VAE."""
     if decoder == FULL:
         return None
     vae: Any = getattr(pipe, "vae", None)
-    channels, cell = (None, None) if vae is None else _latent_of(vae)
-    cure, known = "", None if vae is None else KNOWN.get((channels, cell, vae.config.get("scaling_factor")))
-    if cell is None:
+    latent = None if vae is None else LatentGrid.of(vae)
+    if latent is None or latent.cell_px is None:
         cure = "It has no latent of a single image: it works on pixels, or its autoencoder is for videos."
-    elif decoder == TINY and known is None:
-        cure = f"None is published for its latent of {channels} channels; give a folder or a hub id of one."
-    if cure:
         bad_value("decoder", f"{FULL!r} with {type(pipe).__name__}", repr(decoder), cure)
-    decoder = known if decoder == TINY and known else decoder
+    if decoder == TINY:
+        decoder = _published(pipe, latent, vae.config.get("scaling_factor"))
     tiny = _loaded(decoder, pipe.dtype, str(pipe._execution_device))
-    if _latent_of(tiny) != (channels, cell):
-        got = "{} channels, {} px a cell, in {!r}".format(*_latent_of(tiny), decoder)
-        bad_value("decoder", f"of the prior's latent ({channels} channels, {cell} px a cell)", got)
+    own = LatentGrid.of(tiny)
+    if own != latent:
+        bad_value("decoder", f"of the prior's latent ({latent})", f"{own}, in {decoder!r}")
     return tiny
+
+
+def _published(pipe: Any, latent: LatentGrid, scaling_factor: float | None) -> str:
+    """The hub id of the tiny autoencoder that is published for the latent of a pipeline."""
+    for each in PUBLISHED:
+        if (each.latent, each.scaling_factor) == (latent, scaling_factor):
+            return each.hub_id
+    cure = (
+        f"None is published for its latent of {latent.channels} channels; give a folder or a hub id of one."
+    )
+    bad_value("decoder", f"{FULL!r} with {type(pipe).__name__}", repr(TINY), cure)
 
 
 @lru_cache(maxsize=1)

@@ -8,7 +8,7 @@ import torch
 from diffusers import AutoencoderTiny
 
 from geodiff_plugin.runtime import codec
-from geodiff_plugin.runtime.codec import KNOWN, _loaded
+from geodiff_plugin.runtime.codec import PUBLISHED, _loaded
 from tests.tiny import guided_call, make_vae
 
 
@@ -106,7 +106,8 @@ def test_what_cannot_decode_is_refused(guided, tmp_path, monkeypatch):
 def test_sd_2s_latent_is_known(pipe, guided, monkeypatch):
     loaded = Mock(return_value=make_vae())
     pipe.vae.register_to_config(scaling_factor=0.18215)
-    monkeypatch.setitem(KNOWN, (4, 2, 0.18215), KNOWN[4, 8, 0.18215])  # a tiny one has cells of 2 pixels
+    of_2_px = [each._replace(latent=each.latent._replace(cell_px=2)) for each in PUBLISHED]
+    monkeypatch.setattr(codec, "PUBLISHED", of_2_px)  # the cells of the tests' VAE
     monkeypatch.setattr(codec, "_loaded", loaded)
     guided("tiny")
     assert {call.args[0] for call in loaded.call_args_list} == {"madebyollin/taesd"}
