@@ -28,7 +28,7 @@ from tests.scenes.sequences import render_sequence
 
 def read_frames(left: Path, right: Path, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """The first frames of both videos, ``(H, W, 3)`` in [0, 1] each; as many as both have, at most."""
-    count = min(count, video_facts(left)[0], video_facts(right)[0])
+    count = min(count, video_facts(left).frames, video_facts(right).frames)
     with VideoReader(left) as lefts, VideoReader(right) as rights:
         for i in range(count):
             yield lefts.read(i), rights.read(i)

@@ -36,15 +36,19 @@ __version__ = "0.1.0"
 
 #: Module -> its public names, imported on first use so that ``import geodiff_plugin`` stays quick.
 _NAMES_OF = {
-    "_checks": "InputError",
-    "bundled": "load_bundled_prior",
-    "capture.frames": "Capture",
-    "config": "GuidanceConfig",
-    "formats.reading": "read_calibration",
-    "evidence.guidance": "GeometryGuidance",
-    "priors": "PRIORS load_prior",
-    "runtime.guided_call": "GuidedMarigoldDepthPipeline disable_geometry_guidance enable_geometry_guidance",
-    "types": "MetricDepthOutput Rig",
+    "_checks": ("InputError",),
+    "bundled": ("load_bundled_prior",),
+    "capture.frames": ("Capture",),
+    "config": ("GuidanceConfig",),
+    "evidence.guidance": ("GeometryGuidance",),
+    "formats.reading": ("read_calibration",),
+    "priors": ("PRIORS", "load_prior"),
+    "runtime.guided_call": (
+        "GuidedMarigoldDepthPipeline",
+        "disable_geometry_guidance",
+        "enable_geometry_guidance",
+    ),
+    "types": ("MetricDepthOutput", "Rig"),
 }
 _MODULE_OF = modules_of(__name__, _NAMES_OF)
 __all__ = sorted(_MODULE_OF)

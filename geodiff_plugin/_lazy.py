@@ -5,14 +5,14 @@ from __future__ import annotations
 import gc
 import importlib
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 
-def modules_of(package: str, names_of: Mapping[str, str]) -> dict[str, str]:
-    """The module of every public name; ``names_of`` has a module's names, separated by blanks."""
-    return {name: f"{package}.{module}" for module, names in names_of.items() for name in names.split()}
+def modules_of(package: str, names_of: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """The module of every public name of a package; ``names_of`` has the names of each module."""
+    return {name: f"{package}.{module}" for module, names in names_of.items() for name in names}
 
 
 def importer(package: str, module_of: Mapping[str, str]) -> Callable[[str], Any]:

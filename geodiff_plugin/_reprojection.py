@@ -66,6 +66,14 @@ def depth_in_camera(depth: np.ndarray, K: np.ndarray, camera: PosedCamera) -> np
     return result
 
 
+class _Seen(NamedTuple):
+    """Samples of a surface as the other camera sees them, ``(n,)`` each."""
+
+    u: np.ndarray  # columns, pixels
+    v: np.ndarray  # rows
+    z: np.ndarray  # depths, in the unit of the first camera's
+
+
 def _inverse(depth: np.ndarray) -> np.ndarray:
     """``1 / depth`` float64, of which a plane is a linear function of the pixel; 0 where unknown."""
     known = np.isfinite(depth) & (depth > 0)
@@ -78,10 +86,8 @@ def _is_surface(*corners: np.ndarray) -> np.ndarray:
     return (least > 0) & (most <= (1.0 + JUMP) * least)
 
 
-def _samples(
-    inverse: np.ndarray, rows: slice, K: np.ndarray, camera: PosedCamera
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Columns, rows and depths in the other camera: of every known pixel of a strip, and within its cells."""
+def _samples(inverse: np.ndarray, rows: slice, K: np.ndarray, camera: PosedCamera) -> Iterator[_Seen]:
+    """Every known pixel of a strip, and places within its cells, as the other camera sees them."""
     strip = inverse[rows.start : rows.stop + 1]  # with the row below, which its last cells need
     own = strip[: rows.stop - rows.start]
     y, x = np.nonzero(own > 0)
@@ -115,15 +121,13 @@ def _samples_a_side(
     return int(np.clip(np.ceil(farthest / SPACING_PX), 1, MOST_SAMPLES))
 
 
-def _seen(
-    x: np.ndarray, y: np.ndarray, inverse: np.ndarray, K: np.ndarray, camera: PosedCamera
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Column, row and depth in the other camera of pixels ``(n,)`` of the first, by their inverse depth."""
+def _seen(x: np.ndarray, y: np.ndarray, inverse: np.ndarray, K: np.ndarray, camera: PosedCamera) -> _Seen:
+    """Pixels ``(n,)`` of the first camera in the other one, by their inverse depth."""
     rays = np.linalg.inv(K) @ np.stack([x, y, np.ones(len(x))])
     points = camera.E[:3, :3].T @ (rays / inverse - camera.E[:3, 3:])
     z = points[2]
     u, v, _ = camera.K @ (points / np.where(z > NEAREST, z, 1.0))
-    return u, v, z
+    return _Seen(u, v, z)
 
 
 def _at_centres(

@@ -207,10 +207,15 @@ class Capture:
     def check_points(self, points: str, scaled: bool = False) -> None:
         """``InputError`` where no frame has such known depths, or they will not be in metres (``scaled``)."""
         check_choice(points, "points", POINTS)
-        of = {"model": "points", "depth": "depth"}.get(points)
-        if of and all(getattr(frame, of) is None for frame in self.frames):
+        if points == "model":
+            are_known = any(frame.points is not None for frame in self.frames)
+        elif points == "depth":
+            are_known = any(frame.depth is not None for frame in self.frames)
+        else:
+            return
+        if not are_known:
             bad_value("points (--points)", "known depths that the capture has", repr(points))
-        if of and self.unit is None and not scaled:
+        if self.unit is None and not scaled:
             cure = "Give --metres-per-unit, --known-length or --distance."
             bad_value("points (--points)", "of a capture whose scale is known", "one without a unit", cure)
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from geodiff_plugin._lazy import importer, modules_of
 
 #: What other programs use, by module; imported on first use, since some of them need torch.
-_NAMES = {
+_NAMES_OF = {
     "clouds": ("Cloud", "flying_points", "make_cloud", "make_mesh", "write_glb", "write_ply"),
     "colmap": ("write_colmap",),
     "depth": ("read_depth_png", "write_depth_mm", "write_depth_npy", "write_pfm"),
@@ -20,11 +19,6 @@ _NAMES = {
     "rigs": ("rig_from_parameters",),
 }
 
-__all__ = sorted(name for names in _NAMES.values() for name in names)  # noqa: PLE0605
-
-
-def __getattr__(name: str) -> Any:
-    module = next((module for module, names in _NAMES.items() if name in names), None)
-    if module is None:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+_MODULE_OF = modules_of(__name__, _NAMES_OF)
+__all__ = sorted(_MODULE_OF)
+__getattr__ = importer(__name__, _MODULE_OF)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -121,6 +122,15 @@ class TypedCamera:
     fov: float | None = None
 
 
+class FoundFrames(NamedTuple):
+    """What ``read_capture`` finds, as ``Capture`` takes it."""
+
+    frames: list[CaptureFrame]  # in order
+    kind: str  # of its layout
+    unit: str | None  # of its poses: ``"m"``, or ``None`` if unknown
+    notes: list[Message]  # for the user
+
+
 def read_capture(
     path: PathLike,
     *,
@@ -128,8 +138,8 @@ def read_capture(
     fov: float | None = None,
     trajectory: PathLike | None = None,
     images: PathLike | None = None,
-) -> tuple[list[CaptureFrame], str, str | None, list[Message]]:
-    """The frames of a capture in order, the kind of its layout, its unit, and notes for the user.
+) -> FoundFrames:
+    """The frames of a capture, and what is known of all of them.
 
     ``K`` and ``fov`` (horizontal, degrees) are for layouts without intrinsics, and go before the files'.
     ``trajectory`` has a video's lines ``seconds tx ty tz qx qy qz qw``, camera-to-world, OpenCV's axes.
@@ -158,7 +168,7 @@ def read_capture(
         bad_value("a capture", "at least two frames", f"{len(frames)} in {source}", cure)
     named = zip(frames, unique_names(frames), strict=True)
     frames = [replace(frame, name=name) for frame, name in named]
-    return frames, layout.kind, layout.unit if tracked else None, notes
+    return FoundFrames(frames, layout.kind, layout.unit if tracked else None, notes)
 
 
 def _layout(source: Path, trajectory: Path | None, images: Path | None) -> Layout:
@@ -276,4 +286,6 @@ def _some(names: Sequence[str]) -> str:
     shown = [
         name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}..." for name in names[:MOST_NAMES]
     ]
-    return f"{', '.join(shown)}{', ...' * (len(names) > MOST_NAMES)}"
+    if len(names) > MOST_NAMES:
+        shown.append("...")
+    return ", ".join(shown)

@@ -15,7 +15,7 @@ import struct
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -242,31 +242,39 @@ def read_model(files: Files) -> Model:
     return _model(*map(calibration_text, files))
 
 
+class _SeenPoint(NamedTuple):
+    """A point of a model, as its file has it."""
+
+    xyz: Sequence[Any]
+    error_px: Any
+    images: Sequence[Any]  # numbers of those that see it
+
+
 def read_points(folder: Path) -> dict[int, np.ndarray]:
     """The reliable points ``(n, 3)`` that an image of a model sees, by its number, in the model's world."""
     path = folder / "points3D.txt"
     rows = _text_points(path) if path.exists() else _binary_points(path.with_suffix(".bin"))
     seen: dict[int, list[Sequence[Any]]] = {}
-    for xyz, error_px, images in rows:
-        if len(images) >= FEWEST_VIEWS and float(error_px) <= MOST_ERROR_PX:
-            for image in set(images):
-                seen.setdefault(int(image), []).append(xyz)
+    for point in rows:
+        if len(point.images) >= FEWEST_VIEWS and float(point.error_px) <= MOST_ERROR_PX:
+            for image in set(point.images):
+                seen.setdefault(int(image), []).append(point.xyz)
     return {image: array_of(points, (-1, 3), f"points of {path}") for image, points in seen.items()}
 
 
-def _text_points(path: Path) -> Iterator[tuple[Sequence[Any], Any, Sequence[Any]]]:
+def _text_points(path: Path) -> Iterator[_SeenPoint]:
     with path.open(encoding="utf-8") as file:
         for line in file:
             words = line.split()
             if words and not line.startswith("#"):
-                yield words[1:4], words[7], words[8::2]
+                yield _SeenPoint(words[1:4], words[7], words[8::2])
 
 
-def _binary_points(path: Path) -> Iterator[tuple[Sequence[Any], Any, Sequence[Any]]]:
+def _binary_points(path: Path) -> Iterator[_SeenPoint]:
     take = _Bytes(check_file(path, "the model", "points3D.txt or points3D.bin"))
     for _ in range(*take("Q")):
         *xyz, error_px, seen = take("8x3d3xdQ")
-        yield xyz, error_px, take(f"{2 * seen}I")[::2]
+        yield _SeenPoint(xyz, error_px, take(f"{2 * seen}I")[::2])
 
 
 def read_colmap(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
@@ -292,8 +300,16 @@ def _models_below(path: Path) -> Iterator[list[Files]]:
             yield models
 
 
-def _largest(models: Iterable[Files], project: Path) -> tuple[Files, Model, tuple[Message, ...]]:
-    """The model with most images, the first of several, and what to say where there are others."""
+class _Chosen(NamedTuple):
+    """The model that is read, of those of one place."""
+
+    files: Files
+    model: Model
+    notes: tuple[Message, ...] = ()  # on the others
+
+
+def _largest(models: Iterable[Files], project: Path) -> _Chosen:
+    """The model with most images, the first of several."""
     read = [(files, read_model(files)) for files in models]
     files, model = max(read, key=lambda each: len(each[1].images))
     others = [
@@ -302,10 +318,11 @@ def _largest(models: Iterable[Files], project: Path) -> tuple[Files, Model, tupl
         if other is not model
     ]
     if not others:
-        return files, model, ()
+        return _Chosen(files, model)
     said = f"{files[0].parent.relative_to(project)}, with {len(model.images)} images, is used"
     note = f"{said}, the largest of {len(read)} models; left out: {', '.join(others)}."
-    return files, model, (Message("capture.part", f"{note} To take another, give its folder."),)
+    notes = (Message("capture.part", f"{note} To take another, give its folder."),)
+    return _Chosen(files, model, notes)
 
 
 def _around(folder: Path, project: Path) -> list[Path]:

@@ -6,7 +6,7 @@ import configparser
 import json
 import re
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -93,7 +93,15 @@ def _rs_camera(values: Entries) -> Camera:
     return Camera(K, (values["width"], values["height"]), coefficients, model)
 
 
-def _rs_printed(text: str, choice: CameraChoice) -> tuple[Camera, Camera, np.ndarray]:
+class _Pair(NamedTuple):
+    """Two cameras, and what maps points of the left one's frame to the right one's, metres."""
+
+    left: Camera
+    right: Camera
+    T: np.ndarray  # (4, 4)
+
+
+def _rs_printed(text: str, choice: CameraChoice) -> _Pair:
     """Of what ``rs-enumerate-devices -c`` prints, which holds every resolution."""
     cameras: dict[str, dict[tuple[int, int], Camera]] = {"1": {}, "2": {}}
     for side, block in RS_INTRINSIC.findall(text):
@@ -104,10 +112,10 @@ def _rs_printed(text: str, choice: CameraChoice) -> tuple[Camera, Camera, np.nda
     left, right = (of_size(cameras[side], choice) for side in "12")
     between = [*RS_EXTRINSIC.findall(text), ""][0]
     rotation, translation = (NUMBER.findall(part) for part in between.partition("Translation")[::2])
-    return left, right, transform(rotation[:9], translation[:3], "the extrinsics")
+    return _Pair(left, right, transform(rotation[:9], translation[:3], "the extrinsics"))
 
 
-def _rs_json(text: str) -> tuple[Camera, Camera, np.ndarray]:
+def _rs_json(text: str) -> _Pair:
     """Of ``rs2_intrinsics``, left before right, and ``rs2_extrinsics`` between them, under any names.
 
     Other cameras are left out where their names say which those of the pair are. Instead of extrinsics there
@@ -123,14 +131,15 @@ def _rs_json(text: str) -> tuple[Camera, Camera, np.ndarray]:
         expected = "two rs2 intrinsics (fx, fy, ppx, ppy), of the infrared pair, and their extrinsics alone"
         cure = "Keep those of the infrared pair; their baseline in metres does for the extrinsics."
         bad_value("the file", expected, f"{len(views)} and {len(between)}", cure)
+    left, right = map(_rs_camera, views)
     if not between:
         T = transform(np.eye(3), (-array_of(baseline, (), "the baseline"), 0, 0), "the baseline")
-        return _rs_camera(views[0]), _rs_camera(views[1]), T
+        return _Pair(left, right, T)
     # rs2 keeps a rotation column by column.
     R = array_of(between[0]["rotation"], (3, 3), "the rotation of the extrinsics").T
     T = transform(R, between[0]["translation"], "the extrinsics")
     # From the left to the right one x becomes smaller; a file that says it the other way round is inverted.
-    return _rs_camera(views[0]), _rs_camera(views[1]), T if T[0, 3] <= 0 else np.linalg.inv(T)
+    return _Pair(left, right, T if T[0, 3] <= 0 else np.linalg.inv(T))
 
 
 def _rs_objects(data: Any, name: str) -> Iterator[tuple[str, Entries]]:

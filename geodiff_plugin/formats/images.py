@@ -206,15 +206,16 @@ def as_image_01(value: Any, name: str) -> torch.Tensor:
     of uint8, uint16 or float in [0, 1]. One channel is repeated, a fourth dropped with a warning.
     """
     if isinstance(value, Image.Image):
-        notes = _file_notes(value, name)
-        hwc, more = _to_01(_array_of(value, name), name)
+        of_file = _file_notes(value, name)
+        hwc, of_pixels = _to_01(_array_of(value, name), name)
+        notes = of_file + of_pixels
         if value.getexif().get(ORIENTATION) in TURNS:
             cure = "turn it with PIL.ImageOps.exif_transpose and give the K of the turned image."
             sentence = f"{name} carries an EXIF orientation that is not applied; {cure}"
-            more.append(Message("image.orientation", sentence))
+            notes.append(Message("image.orientation", sentence))
     else:
-        notes, (hwc, more) = [], _to_01(_hwc(value, name), name)
-    for note in notes + more:
+        hwc, notes = _to_01(_hwc(value, name), name)
+    for note in notes:
         warn(note, stacklevel=3)
     return torch.from_numpy(np.ascontiguousarray(hwc.transpose(2, 0, 1)))
 

@@ -38,8 +38,16 @@ def _open_video(path: Path, name: str) -> cv2.VideoCapture:
     return capture
 
 
-def video_facts(path: Path, name: str = "video") -> tuple[int, float, tuple[int, int]]:
-    """Number of frames, by going through them: heads are not reliable; frames a second, (width, height)."""
+class VideoFacts(NamedTuple):
+    """What a video file holds."""
+
+    frames: int
+    fps: float  # frames a second
+    size: tuple[int, int]  # (width, height)
+
+
+def video_facts(path: Path, name: str = "video") -> VideoFacts:
+    """What a video holds; its frames are counted by going through them, as heads are not reliable."""
     capture, count = _open_video(path, name), 0
     while capture.grab():
         count += 1
@@ -48,7 +56,7 @@ def video_facts(path: Path, name: str = "video") -> tuple[int, float, tuple[int,
     capture.release()
     if count == 0:
         bad_value(name, "a video with frames in it", f"{path}, which has none")
-    return count, fps or 30.0, (int(width), int(height))
+    return VideoFacts(count, fps or 30.0, (int(width), int(height)))
 
 
 class VideoReader(AbstractContextManager["VideoReader"]):

@@ -32,16 +32,16 @@ if TYPE_CHECKING:
     from geodiff_plugin.jobs.writing import write_pair as write_pair
 
 _NAMES_OF = {
-    "capture": "depth_capture",
-    "many": "depth_pairs",
-    "merge": "merge_shards",
-    "options": "CaptureOptions DepthOptions",
-    "pair": "depth_pair run_pair",
-    "pairs": "PairRef start_many",
-    "prior": "load_guided_prior",
-    "reading": "PairInputs read_pair",
-    "records": "JobLog PairResult PairRun",
-    "writing": "write_pair",
+    "capture": ("depth_capture",),
+    "many": ("depth_pairs",),
+    "merge": ("merge_shards",),
+    "options": ("CaptureOptions", "DepthOptions"),
+    "pair": ("depth_pair", "run_pair"),
+    "pairs": ("PairRef", "start_many"),
+    "prior": ("load_guided_prior",),
+    "reading": ("PairInputs", "read_pair"),
+    "records": ("JobLog", "PairResult", "PairRun"),
+    "writing": ("write_pair",),
 }
 _MODULE_OF = modules_of(__name__, _NAMES_OF)
 __all__ = sorted(_MODULE_OF)

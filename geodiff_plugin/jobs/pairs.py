@@ -141,13 +141,13 @@ def _of_folders(left: Path, right: Path | None) -> tuple[list[PairRef], Message 
 
 
 def _of_videos(left: Path, right: Path | None) -> tuple[list[PairRef], Message | None]:
-    frames = video_facts(left, "LEFT")[0]
+    frames = video_facts(left, "LEFT").frames
     if right is None:
         sentence = f"{left} holds both views side by side; else name both videos."
         return _frames(frames, left, None), Message("pairs.side-by-side", sentence)
     if not is_video(right):
         bad_value("RIGHT", f"a video too ({', '.join(VIDEOS)}), or left out", right)
-    if (others := video_facts(right, "RIGHT")[0]) != frames:
+    if (others := video_facts(right, "RIGHT").frames) != frames:
         counts = f"LEFT has {frames} frames and RIGHT {others}"
         refuse(f"{counts}. Cut both videos to the same moments first.")
     return _frames(frames, left, right), None
