@@ -209,16 +209,10 @@ def project_rays(depth_m: Tensor, rays: PlaneRays) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Warped:
-    """The right image on the left grid ``(B, C, H, W)``, its edge repeated where not visible.
+    """A right image seen from the left camera."""
 
-    ``visible (B, 1, H, W)`` bool: in front of the right camera and within its pixel centres; ``uv (B, H, W,
-    2)`` pixels of the right image; ``z_right (B, H, W)`` metres.
-    """
-
-    image: Tensor
-    visible: Tensor
-    uv: Tensor
-    z_right: Tensor
+    image: Tensor  # (B, C, H, W) on the left grid, the edge of the right image repeated where not visible
+    visible: Tensor  # (B, 1, H, W) bool, in front of the right camera and within its pixel centres
 
 
 def sample_at(image: Tensor, uv: Tensor, *, mode: str = "bilinear") -> Tensor:
@@ -269,7 +263,7 @@ def warp_right_to_left(
         rays = rays_of(depth_m, K_left, K_right, T_right_from_left)
     uv, z_right = project_rays(depth_m, rays)
     visible = _inside(uv, z_right, image_size(right))
-    return Warped(sample_at(right, uv), visible, uv, z_right)
+    return Warped(sample_at(right, uv), visible)
 
 
 @torch.no_grad()

@@ -29,7 +29,15 @@ from geodiff_plugin.config import DEFAULT, MARIGOLD_DC, PAPER, UpdatePlan
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.prepare import prepare_evidence, rows_beside
 from geodiff_plugin.formats.images import intrinsics_from_exif
-from geodiff_plugin.geometry import hidden_in_right, is_rectified, project, resize_image, warp_right_to_left
+from geodiff_plugin.geometry import (
+    hidden_in_right,
+    is_rectified,
+    project,
+    project_rays,
+    rays_of,
+    resize_image,
+    warp_right_to_left,
+)
 from geodiff_plugin.matching import build_cost_volume, known_share, points_to_matches, with_points
 from geodiff_plugin.matching.build import inverse_pose_preferred
 from geodiff_plugin.matching.consistency import match_volume
@@ -143,9 +151,10 @@ def cameras() -> dict[str, object]:
     for v, (image, K_right, T) in enumerate(views):
         given = depth_m, K[None], K_right[None], T[None]
         warped = warp_right_to_left(image[None], *given)
-        result |= {f"image_{v}": warped.image, f"visible_{v}": warped.visible, f"z_{v}": warped.z_right}
+        uv, z_right = project_rays(depth_m, rays_of(*given))
+        result |= {f"image_{v}": warped.image, f"visible_{v}": warped.visible, f"z_{v}": z_right}
         result[f"hidden_{v}"] = hidden_in_right(*given, image.shape[-2:])
-        result[f"uv_{v}"] = warped.uv.clamp(-500, 500)
+        result[f"uv_{v}"] = uv.clamp(-500, 500)
     step = torch.full_like(depth_m, 2.0)  # its near part hides about a column, by 7 % of depth
     step[..., 20:40, 30:50] = 1.86
     cameras = K[None], views[0].K[None], views[0].T_right_from_left[None]

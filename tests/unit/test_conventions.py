@@ -87,9 +87,11 @@ def test_convention_tuple_is_left_and_right_and_poses_are_camera_to_world():
 def test_convention_masks_are_boolean_and_nothing_is_nan():
     depth_m = torch.full((1, 1, *SIZE), Z)
     depth_m[..., :4] = 0.01  # leaves the right image
-    warped = g.warp_right_to_left(torch.rand(1, 3, *SIZE), depth_m, K, K, rig(x=B, z=0.5))
+    cameras = K, K, rig(x=B, z=0.5)
+    warped = g.warp_right_to_left(torch.rand(1, 3, *SIZE), depth_m, *cameras)
+    uv, z_right = g.project_rays(depth_m, g.rays_of(depth_m, *cameras))
     assert warped.visible.dtype == torch.bool and 0 < warped.visible.float().mean() < 1
-    assert all(torch.isfinite(values).all() for values in (warped.image, warped.uv, warped.z_right))
+    assert all(torch.isfinite(values).all() for values in (warped.image, uv, z_right))
 
 
 def test_convention_one_entry_an_image_and_networks_in_bfloat16_with_metres_in_float32(
