@@ -76,38 +76,42 @@ SHARE = 0.8
 NORMAL_QUANTILE = 1.2816
 
 
-class _Observations(NamedTuple):
-    """Matches against a map on their grid, ``(B, 1, h, w)`` each, and the links of that grid.
+class _Residuals(NamedTuple):
+    """Matches against a map on their grid, ``(B, 1, h, w)`` each."""
 
-    ``residual`` is the log of a match's inverse depth over the map's, ``noise`` its standard deviation,
-    ``weight`` confidence over relative variance, ``links`` are across and down, at a smoothness of 1.
-    """
+    residual: Tensor  # log of a match's inverse depth over the map's
+    noise: Tensor  # its standard deviation
+    weight: Tensor  # confidence over relative variance
+
+
+class _Observations(NamedTuple):
+    """``_Residuals`` with what else a fit needs of its grid."""
 
     residual: Tensor
     noise: Tensor
     weight: Tensor
-    confidence: Tensor
-    links: tuple[Tensor, Tensor]
+    confidence: Tensor  # (B, 1, h, w) of the matches
+    links: tuple[Tensor, Tensor]  # ``edge_links``, across and down, at a smoothness of 1
 
 
 def _observations(depth_m: Tensor, target: Matches, left_01: Tensor, config: GuidanceConfig) -> _Observations:
     guide = F.interpolate(left_01.float(), target.size, mode="bilinear", antialias=True)
     log_depth = log_depth_at(depth_m, target.size)
-    residual, noise, weight = _residuals(log_depth, target, config.match_noise)
-    return _Observations(residual, noise, weight, target.confidence, edge_links(guide, log_depth))
+    residuals = _residuals(log_depth, target, config.match_noise)
+    return _Observations(*residuals, target.confidence, edge_links(guide, log_depth))
 
 
-def _residuals(log_depth: Tensor, target: Matches, match_noise: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Residual, noise and weight of ``_Observations``."""
+def _residuals(log_depth: Tensor, target: Matches, match_noise: float) -> _Residuals:
+    """Matches against the log of a map on their grid."""
     if use_kernel(log_depth):
         from geodiff_plugin.algorithm import correction_kernels as kernels
 
-        return kernels.residuals(log_depth, target, match_noise)
+        return _Residuals(*kernels.residuals(log_depth, target, match_noise))
     matched, step = target.inverse_depth.clamp_min(1e-9), target.plane_step.view(-1, 1, 1, 1)
     noise = ((step / matched) ** 2 + match_noise**2).sqrt()
     weight = target.confidence * (match_noise / noise) ** 2
     residual = torch.where(weight > 0, matched.log() + log_depth, torch.zeros_like(matched))
-    return residual, noise, weight
+    return _Residuals(residual, noise, weight)
 
 
 def log_depth_at(depth_m: Tensor, size: tuple[int, int]) -> Tensor:

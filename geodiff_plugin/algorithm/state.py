@@ -13,9 +13,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin.algorithm.correction import correction_target, fit_depth, local_error, prior_error
+from geodiff_plugin.algorithm.depth_range import fit_depth_range, search_one_number, span_of_points
 from geodiff_plugin.algorithm.gradients import RULES, SUMMED, FiniteWatch
 from geodiff_plugin.algorithm.member import Member
-from geodiff_plugin.algorithm.settling import fit_depth_range, search_one_number, span_of_points
 from geodiff_plugin.algorithm.terms import Given, Loss, Objective
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
@@ -43,10 +43,11 @@ def chunk_views(evidence: Sequence[Evidence]) -> PosedViews:
     for v in range(max(len(grid.views) for grid in grids)):
         views = [grid.views[v if v < len(grid.views) else 0] for grid in grids]
         height, width = (max(view.image_01.shape[axis] for view in views) for axis in (-2, -1))
-        sized = [CameraView(*resize_image(image, K, (height, width)), T) for image, K, T in views]
-        further.append(CameraView(*map(torch.stack, zip(*sized, strict=True))))
-    left, K_left = torch.stack([grid.left_01 for grid in grids]), torch.stack([grid.K_left for grid in grids])
-    return PosedViews(left, tuple(further), K_left)
+        sized = [resize_image(image, K, (height, width)) for image, K, _ in views]
+        images, Ks = (torch.stack(each) for each in zip(*sized, strict=True))
+        further.append(CameraView(images, Ks, torch.stack([view.T_right_from_left for view in views])))
+    left_01, K_left = (torch.stack([getattr(g, name) for g in grids]) for name in ("left_01", "K_left"))
+    return PosedViews(left_01, tuple(further), K_left)
 
 
 class Trajectory:
@@ -60,7 +61,7 @@ class Trajectory:
         step_latents: size of a gradient update of the latent.
     """
 
-    affine: AffineState  # after the latest update; set by ``settle_scale``
+    affine: AffineState  # after the latest update; set by ``find_scale``
     reflection_weight: Tensor | None = None  # (B, 1, H, W), factor on the confidence of matches
     error: Tensor | None = None  # (B, 1, 1, 1), ``correction.prior_error`` of the first estimate
     hidden: Tensor | None = None  # (B, V, 1, H, W) bool, what the estimate hides from the right cameras
@@ -104,10 +105,10 @@ class Trajectory:
             self.prior_depth_m = self.metric(x, self.metric.from_range(near_m, far_m))
         if self.rank_correlation is None:
             self.rank_correlation = self._rank_correlation(x)
-        self.settle_scale(x)
+        self.find_scale(x)
         self._judge_matches(x)
 
-    def settle_scale(self, x: Tensor) -> None:
+    def find_scale(self, x: Tensor) -> None:
         """Search g_s and the start of scale and shift for a relative map (S7.3), or improve those in use."""
         is_first = self._affine_start is None
         if self.config.search == "volume":
@@ -197,8 +198,8 @@ class Trajectory:
         return self.metric.relative(self.metric(x, self.affine) * torch.exp(-change), self.affine)
 
     def loss(self, x: Tensor, affine: AffineState, z0: Tensor, anchor: Tensor) -> Loss:
-        """Loss of an estimate ``x``, decoded from ``z0``, whose scale is settled; as ``Objective``."""
-        assert self._affine_start is not None  # the scale is settled
+        """Loss of an estimate ``x``, decoded from ``z0``, whose scale is known; as ``Objective``."""
+        assert self._affine_start is not None  # of find_scale
         matches = None  # less those that look like reflections
         if self.matches is not None and self.reflection_weight is not None:
             matches = replace(self.matches, confidence=self.reflection_weight * self.matches.confidence)

@@ -137,7 +137,8 @@ def guided_step(
     """Run the rounds of one denoising step, whose corrected map is the result if it ``is_last``."""
     z, anchor, x, is_current = estimate.latent, None, None, False
     for k, (corrects, updates) in enumerate(rounds):
-        is_current, before = corrects and not updates, None
+        is_current = corrects and not updates
+        first_loss: Loss | None = None  # of the round, before its updates
         if corrects:
             is_result = is_last and k == len(rounds) - 1 and not updates
             moved, x = corrected_step(state, estimate, z, is_result)
@@ -150,7 +151,7 @@ def guided_step(
         for i in range(updates):
             anchor = estimate.z0(z).detach() if anchor is None else anchor
             z, x, loss = gradient_step(state, estimate, z, anchor, is_first=i == 0)
-            before = before or loss
-        state.report(before)
+            first_loss = loss if first_loss is None else first_loss
+        state.report(first_loss)
     assert x is not None  # there is one round at least
     return GuidedStep((z - estimate.latent).detach(), x, is_current)

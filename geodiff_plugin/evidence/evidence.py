@@ -30,7 +30,7 @@ class Evidence:
     reliable: Matches | None = None  # ``matches`` as points for the search, where enough are reliable
     rows: Beside[RowMatches] | None = None  # of a rectified pair, at the image's size; act 3 asks for them
     report: Beside[PoseReport] | None = None  # how the poses fit, where act 3 asks
-    noticed: tuple[Message, ...] = ()  # what was noticed beside it
+    noticed: tuple[Message, ...] = ()  # what the matching warns of
 
     def within(self, valid: Tensor) -> Self:
         """The same with confidence 0 where a prior is not ``valid``, on any grid; points stay if none is."""

@@ -16,7 +16,7 @@ from geodiff_plugin.algorithm.gradients import RULES
 from geodiff_plugin.algorithm.terms import TERMS
 from geodiff_plugin.config import PRESETS, GuidanceConfig, UpdatePlan
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.evidence.inputs import Arguments, read_inputs, split_views
+from geodiff_plugin.evidence.inputs import Arguments, Inputs, read_inputs, split_views
 from geodiff_plugin.evidence.photographs import EstimatedRig, KnownLengths, estimate_rig
 from geodiff_plugin.evidence.prepare import make_evidence
 from geodiff_plugin.evidence.store import EvidenceStore
@@ -72,7 +72,7 @@ class GeometryGuidance:
 
     Attributes:
         inputs: the checked input, one entry per left image.
-        config: the hyperparameters as given; ``None`` where they are chosen automatically.
+        config: the hyperparameters as given; one that is ``None`` is chosen automatically (``as_run``).
         evidence_store: cache of cost volumes and matches for further calls with the same images, cameras and
             settings; ``None``, the default, for no cache.
         estimated: cameras estimated by ``from_photographs``; ``None`` where poses were given.
@@ -337,15 +337,9 @@ class GeometryGuidance:
         if self._left_size not in (None, size[::-1]):
             width, height = self._left_size
             bad_value("image", f"of {width}x{height} pixels, as the left view", f"{size[1]}x{size[0]}")
-        for i, given in enumerate(self.inputs):
-            rights = [
-                (image_size(v.image_01) == size, r) for v, r in zip(given.views, given.rigs, strict=True)
-            ]
-            if any(not same and r.K_right is r.K_left for same, r in rights) and not self._cropped:
-                bad_value("K", "a tuple (K_left, K_right), as the images differ in size", "one matrix")
-            checked = any(same and (r.K_right == r.K_left).all() for same, r in rights)
-            if not (self._cropped or checked):  # by the constructor, with the right image
-                check_size_of(given.K_left, size, "K" if count == 1 else f"K[{i}]", "the left image")
+        if not self._cropped:
+            for i, given in enumerate(self.inputs):
+                _check_K_fits(given, size, "K" if count == 1 else f"K[{i}]")
 
     def prepare(self, lefts_01: Tensor) -> list[Evidence]:
         """The ``Evidence`` of every left image ``(N, 3, H, W)`` in [0, 1], native, on the device to use."""
@@ -360,6 +354,16 @@ class GeometryGuidance:
                 make(left_01, given, self.config, self.measured_baseline)
                 for left_01, given in zip(lefts_01, self.inputs, strict=True)
             ]
+
+
+def _check_K_fits(given: Inputs, size: tuple[int, int], name: str) -> None:
+    """Refuse a K that does not belong to a left image of ``size`` ``(H, W)``."""
+    like_left = [image_size(view.image_01) == size for view in given.views]
+    if given.shared_intrinsics and not all(like_left):
+        bad_value("K", "a tuple (K_left, K_right), as the images differ in size", "one matrix")
+    pairs = zip(like_left, given.rigs, strict=True)
+    if not any(same_size and np.array_equal(rig.K_left, rig.K_right) for same_size, rig in pairs):
+        check_size_of(given.K_left, size, name, "the left image")  # else the constructor has checked it
 
 
 def assumed_centre(rigs: Sequence[Rig]) -> list[Message]:

@@ -37,6 +37,7 @@ class Inputs:
     rigs: tuple[Rig, ...]  # their cameras in float64, for reports and exports
     points: Tensor | None  # float32 metres as ``points_to_matches`` takes them
     unit: str | None = "m"
+    shared_intrinsics: bool = False  # one K was given for all views, so their images must have one size
 
     def beside(self, left_01: Tensor) -> PosedViews:
         """The left image with its right views on its device, and their cameras on the CPU; all float32."""
@@ -82,11 +83,15 @@ def read_inputs(given: Arguments, *, cropped: bool = False, unit: str | None = "
     for i in range(count):
         label = "{}" if count == 1 else f"{{}}[{i}]"
         inputs.append(_read_image(given.of_image(i, count), label, cropped, unit))
-    have_points = [entry.points is not None for entry in inputs]
-    for name, there in (("right", [bool(entry.views) for entry in inputs]), ("points", have_points)):
-        if any(there) and not all(there):
-            bad_value(name, "given for every left image or for none", f"None for {there.index(False)}")
+    _check_for_all("right", [bool(entry.views) for entry in inputs])
+    _check_for_all("points", [entry.points is not None for entry in inputs])
     return inputs
+
+
+def _check_for_all(name: str, given: list[bool]) -> None:
+    """Refuse an argument that is given for some left images only."""
+    if any(given) and not all(given):
+        bad_value(name, "given for every left image or for none", f"None for {given.index(False)}")
 
 
 def _read_image(given: Arguments, label: str, cropped: bool, unit: str | None) -> Inputs:
@@ -94,27 +99,32 @@ def _read_image(given: Arguments, label: str, cropped: bool, unit: str | None) -
     points: Tensor | None = None
     if given.points is not None:
         points = as_points(given.points, label.format("points"), given.points_confidence)
-    right, K = given.right, given.K
-    several = right if isinstance(right, tuple) else (right,)
-    rights = () if right is None else several
+    several = given.right if isinstance(given.right, tuple) else (given.right,)
+    rights = () if given.right is None else several
     count, name = len(rights), label.format("right")
     names = [name if count == 1 else f"{name}, view {v + 1}," for v in range(count)]
     images = [as_image_01(image, name) for image, name in zip(rights, names, strict=True)]
-    K_left, K_rights = _intrinsics(K, label.format("K"), count)
+    K_name, shared = label.format("K"), not isinstance(given.K, tuple)
+    K_left, K_rights = _intrinsics(given.K, K_name, count)
     poses = _poses(given.E, label.format("E"), count, unit)
     rigs = tuple(Rig(K_left, K_right, pose) for K_right, pose in zip(K_rights, poses, strict=True))
-    for v, (K_right, image) in enumerate(zip(K_rights, images, strict=True)):
+    for v, (rig, image) in enumerate(zip(rigs, images, strict=True)):
         if not cropped:
-            of_view = isinstance(K, tuple) and not np.array_equal(K_right, K_left)
-            K_name = f"{label.format('K')}[{_view(v, count)}]" if of_view else label.format("K")
-            check_size_of(K_right, image_size(image), K_name, "the right image")
+            is_left = shared or np.array_equal(rig.K_right, K_left)
+            named = K_name if is_left else f"{K_name}[{_view(v, count)}]"
+            check_size_of(rig.K_right, image_size(image), named, "the right image")
         if isinstance(rights[v], Image.Image):
-            warn_of_other_lens(rights[v], K_right, names[v])
-    matrices = [(torch.from_numpy(rig.K_right), torch.from_numpy(rig.T_right_from_left)) for rig in rigs]
-    views = tuple(CameraView(x, K.float(), T.float()) for x, (K, T) in zip(images, matrices, strict=True))
+            warn_of_other_lens(rights[v], rig.K_right, names[v])
+    views = tuple(_camera_view(image, rig) for image, rig in zip(images, rigs, strict=True))
     if points is not None and unit == "m":
         warn_of_far_points(points.numpy(), label.format("points"))
-    return Inputs(K_left, views, rigs, points, unit)
+    return Inputs(K_left, views, rigs, points, unit, shared)
+
+
+def _camera_view(image_01: Tensor, rig: Rig) -> CameraView:
+    """A right image with its camera in float32."""
+    K, T = torch.from_numpy(rig.K_right), torch.from_numpy(rig.T_right_from_left)
+    return CameraView(image_01, K.float(), T.float())
 
 
 def _is_nested_matrix(value: list[Any]) -> bool:

@@ -57,7 +57,8 @@ def make_evidence(
         posed = _with_clean_images(posed, config)
         report = Beside.known(unchecked(posed.views))
         return replace(prepare_evidence(posed, points, config), report=report)
-    (clear, measured), evidence = _measured_beside(posed, config), None
+    clear, measured = _measured_beside(posed, config)
+    evidence = None
     if leaves_cpu_free(left_01.device):
         # Matching features keeps the CPU busy; meanwhile the device matches the views as given, as most fit.
         with suppress(InputError):  # raised again below, unless a refined pose mends it

@@ -17,36 +17,36 @@ from geodiff_plugin.matching.planes import even_planes, parallax_of
 from geodiff_plugin.matching.sweep import CostVolume, sweep_planes
 from geodiff_plugin.types import CameraView, PosedViews
 
-# With fewer planes, a parabola through three neighbouring costs fits nothing.
+#: With fewer planes, a parabola through three neighbouring costs fits nothing.
 _FEWEST_PLANES = 24
 #: How far the median pixel moves from one plane to the next, px: below a pixel, for positions between planes.
 PLANE_STEP_PX = 0.75
-# Pixels of the coarse sweep that finds how near the planes must reach.
+#: Pixels of the coarse sweep that finds how near the planes must reach.
 PILOT_PIXELS = 20_000
-# Upper bound on its planes.
+#: Upper bound on its planes.
 PILOT_PLANES = 160
-# The shift of the median pixel from one of its planes to the next, px.
+#: The shift of the median pixel from one of its planes to the next, px.
 PILOT_STEP_PX = 1.0
-# The coarse sweep reaches to the depth that shifts by this, in image widths, in the view that moves least: a
-# near surface leaves the view that moves most while others still show it.
+#: The coarse sweep reaches to the depth that shifts by this, in image widths, in the view that moves least: a
+#: near surface leaves the view that moves most while others still show it.
 PILOT_SHIFT = 0.4
-# It reaches at most this many times nearer than that depth for the view that moves most.
+#: It reaches at most this many times nearer than that depth for the view that moves most.
 MOST_NEARER = 3.0
-# Matches of the coarse sweep count above this confidence.
+#: Matches of the coarse sweep count above this confidence.
 PILOT_CONFIDENCE = 0.8
-# The quantile of their inverse depth that is taken as nearest: a few matches are wrong.
+#: The quantile of their inverse depth that is taken as nearest: a few matches are wrong.
 PILOT_QUANTILE = 0.995
-# If fewer pixels than this share have such a match, the planes reach as near as the coarse sweep did.
+#: If fewer pixels than this share have such a match, the planes reach as near as the coarse sweep did.
 PILOT_LEAST_SHARE = 0.03
-# The planes reach this factor nearer than the nearest match.
+#: The planes reach this factor nearer than the nearest match.
 HEADROOM = 1.25
-# They reach to this shift at least, in image widths.
+#: They reach to this shift at least, in image widths.
 LEAST_SHIFT = 0.03
-# The inverse pose is preferred if it matches this many times as much of the image as the given one.
+#: The inverse pose is preferred if it matches this many times as much of the image as the given one.
 _CLEARLY = 1.25
-# Pixels of the sweeps that compare the two poses.
+#: Pixels of the sweeps that compare the two poses.
 _INVERSE_PIXELS = 15_000
-# If the given pose matches this share of the image, the inverse pose is not tried.
+#: If the given pose matches this share of the image, the inverse pose is not tried.
 _ENOUGH_MATCHED = 0.4
 
 

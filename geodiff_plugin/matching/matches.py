@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
@@ -102,6 +102,29 @@ def _indices(masks: Tensor) -> list[Tensor]:
     return [row[1 : 1 + number] for row, number in zip(indices, count[:, -1].tolist(), strict=True)]
 
 
+class _PixelDepths(NamedTuple):
+    """Known depths at places of the left image."""
+
+    uv: Tensor  # (N, 2) pixels
+    z: Tensor  # (N,) metres
+    confidence: Tensor | None  # (N,) in (0, 1]; ``None`` for 1
+
+
+def _pixel_depths(points: Tensor, K_left: Tensor, size: tuple[int, int]) -> _PixelDepths:
+    """Where known depths, in either form of ``points_to_matches``, lie in the left image."""
+    if points.ndim == 2 and points.shape[1] in (3, 4):
+        uv, z = project(points[None, None, :, :3], K_left[None])
+        return _PixelDepths(uv[0, 0], z[0, 0], points[:, 3] if points.shape[1] == 4 else None)
+    if tuple(points.shape[:2]) != size:
+        cure = "A sparse depth map belongs to the left image, pixel by pixel; else give points (N, 3)."
+        got = f"{points.shape[1]}x{points.shape[0]}"
+        bad_value("points", f"a map of the left image's {size[1]}x{size[0]} pixels", got, cure)
+    depth_m = points if points.ndim == 2 else points[..., 0]
+    rows, columns = (depth_m > 0).nonzero(as_tuple=True)
+    confidence = points[rows, columns, 1] if points.ndim == 3 else None
+    return _PixelDepths(torch.stack([columns, rows], dim=1).float(), depth_m[rows, columns], confidence)
+
+
 def points_to_matches(
     points: Tensor, K_left: Tensor, size: tuple[int, int], size_grid: tuple[int, int]
 ) -> tuple[Matches, int]:
@@ -111,19 +134,7 @@ def points_to_matches(
     1]; or a map ``(H, W)`` of the image's ``size``, 0 where unknown, or ``(H, W, 2)`` with its confidence.
     Of several points in a pixel the nearest wins. ``InputError`` if none is left, or for a map of other size.
     """
-    weight = None
-    if points.ndim == 2 and points.shape[1] in (3, 4):
-        uv, z = project(points[None, None, :, :3], K_left[None])
-        uv, z, weight = uv[0, 0], z[0, 0], points[:, 3] if points.shape[1] == 4 else None
-    else:
-        if tuple(points.shape[:2]) != size:
-            cure = "A sparse depth map belongs to the left image, pixel by pixel; else give points (N, 3)."
-            got = f"{points.shape[1]}x{points.shape[0]}"
-            bad_value("points", f"a map of the left image's {size[1]}x{size[0]} pixels", got, cure)
-        depth_m = points if points.ndim == 2 else points[..., 0]
-        rows, columns = (depth_m > 0).nonzero(as_tuple=True)
-        uv, z = torch.stack([columns, rows], dim=1).float(), depth_m[rows, columns]
-        weight = points[rows, columns, 1] if points.ndim == 3 else None
+    uv, z, weight = _pixel_depths(points, K_left, size)
     # A pixel reaches half a pixel beyond its centre.
     inside = ((uv >= -0.5) & (uv < uv.new_tensor([size[1], size[0]]) - 0.5)).all(dim=1) & (z > NEAREST_M)
     left_out = int((~inside).sum())

@@ -41,16 +41,22 @@ def stack_results(
     over_prior = _together(results, "over_prior")
     maps: dict[str, Any] = {name: _together(results, name) for name in MAPS}
     further: dict[str, Any] = dict(extras or {})
-    read = to_host(_numbers(results, over_prior), *((maps, further) if as_numpy else ()))
-    numbers: dict[str, Any] = dict(read[0])
+    numbers: Mapping[str, Tensor | None] = _numbers(results, over_prior)
     if as_numpy:
-        maps, further = map(_as_arrays, read[1:])
+        numbers, maps, further = to_host(numbers, maps, further)
+        maps, further = _as_arrays(maps), _as_arrays(further)
+    else:
+        (numbers,) = to_host(numbers)
     K = torch.stack([result.K for result in results])
     poses, estimated = [pose_of(result.evidence) for result in results], guidance.estimated
     output = MetricDepthOutput(
         prediction=maps.pop("depth_m"),
         **maps,
-        **numbers,
+        scale=numbers["scale"],
+        shift=numbers["shift"],
+        global_scale=numbers["global_scale"],
+        prior_scale=numbers.get("prior_scale"),
+        prior_error=numbers.get("prior_error"),
         K=K.numpy() if as_numpy else K.to(results[0].depth_m.device),
         history=list(history),
         poses=[pose for pose in poses if pose is not None],

@@ -184,11 +184,10 @@ def _rows_on(size: tuple[int, int], rows: RowMatches) -> RowMatches:
     """Matches of rows on another grid: each pixel takes those of the nearest one."""
     if image_size(rows.shift) == size:
         return rows
-    layers = F.interpolate(torch.stack(rows[:4])[None], size, mode="nearest-exact")[0]
-    shift, matched, hidden, filled = layers
-    return rows._replace(
-        shift=shift * (size[1] / rows.shift.shape[1]), matched=matched, hidden=hidden, filled=filled
-    )
+    layers = torch.stack([rows.shift, rows.matched, rows.hidden, rows.filled])
+    shift, matched, hidden, filled = F.interpolate(layers[None], size, mode="nearest-exact")[0]
+    shift = shift * (size[1] / rows.shift.shape[1])
+    return rows._replace(shift=shift, matched=matched, hidden=hidden, filled=filled)
 
 
 def _median_filtered(values: Tensor) -> Tensor:

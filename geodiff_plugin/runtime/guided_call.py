@@ -86,9 +86,9 @@ class GuidedCall(_Stock):
                 guided call. ``callback_on_step_end`` may call the pipeline, guided or not: it is restored
                 while the callback runs. A call in another thread waits.
         """
-        for name, given in (("callback_on_step_end", callback_on_step_end), ("strict", strict or None)):
-            if guidance is None and given is not None:
-                bad_value(name, "given together with guidance", "guidance=None")
+        if guidance is None and (callback_on_step_end is not None or strict):
+            name = "strict" if callback_on_step_end is None else "callback_on_step_end"
+            bad_value(name, "given together with guidance", "guidance=None")
         with Exclusive(self, guidance is not None) as held:
             if self._guided_run is not None:
                 raise RuntimeError(
@@ -127,14 +127,13 @@ class GuidedCall(_Stock):
         lefts_01 = left_images(lefts)  # (N, 3, H, W)
         prior = prior_of(self)
         _check_arguments(call, len(lefts_01))
-        asked = call["num_inference_steps"]
-        steps, rounds = count_guided_steps(self, guidance, asked)
+        steps, rounds = count_guided_steps(self, guidance, call["num_inference_steps"])
         resampling = call["resample_method_output"] or "bilinear"
         call |= {"num_inference_steps": steps, "resample_method_output": resampling}
         layers = Layers.of(self)
         _check_guidable(self, prior, guidance, layers)
         tiny = tiny_autoencoder(self, guidance.config.decoder)
-        unlocked = None if callback is None else held.without(callback)
+        unlocked = None if callback is None else held.released_during(callback)
         if prior.deterministic and call["ensemble_size"] > 1:
             call |= _one_member(call)
         device = layers.device or super()._execution_device
@@ -256,10 +255,10 @@ def _check_guided_call(guidance: Any, callback: Any) -> None:
         )
 
 
-def count_guided_steps(pipe: Any, guidance: GeometryGuidance, asked: int | None) -> tuple[int, int]:
-    """Denoising steps of a guided call, of which the user ``asked`` for so many, and rounds in each."""
-    wanted = guidance.denoising_steps(asked, pipe.default_denoising_steps)
-    return count_steps(wanted, asked, prior_of(pipe).max_steps)
+def count_guided_steps(pipe: Any, guidance: GeometryGuidance, requested: int | None) -> tuple[int, int]:
+    """Denoising steps of a guided call, of which the user ``requested`` so many, and rounds in each."""
+    wanted = guidance.denoising_steps(requested, pipe.default_denoising_steps)
+    return count_steps(wanted, requested, prior_of(pipe).max_steps)
 
 
 def _check_arguments(call: Mapping[str, Any], images: int) -> None:

@@ -158,8 +158,8 @@ class Exclusive:
     def __exit__(self, *exc: object) -> None:
         self._stack.close()
 
-    def without(self, function: Callable[..., _Answer]) -> Callable[..., _Answer]:
-        """The function, called with all locks released; it waits for them before it returns."""
+    def released_during(self, function: Callable[..., _Answer]) -> Callable[..., _Answer]:
+        """The function, called with all locks released; it takes them again before it returns."""
 
         def unlocked(*args: Any, **kwargs: Any) -> _Answer:
             self.__exit__()

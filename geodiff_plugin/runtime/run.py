@@ -130,7 +130,7 @@ class GuidedRun:
         """
         guidance, call = self.guidance, self.call
         size, count = call["ensemble_size"], len(guidance.inputs)
-        members = [self.members[first : first + size] for first in range(0, count * size, size)]
+        of_images = [self.members[first : first + size] for first in range(0, count * size, size)]
         options = ResultOptions(
             self.config,
             resampling=call["resample_method_output"],
@@ -140,9 +140,12 @@ class GuidedRun:
             centre_assumed=any(message.code == SAME_CENTRE.code for message in guidance.assumed),
         )
         spreads = [None] * count if stock.uncertainty is None else stock.uncertainty.split(1)
-        of_images = zip(self._evidence(), members, stock.prediction.split(1), spreads, strict=True)
+        maps = zip(self._evidence(), of_images, stock.prediction.split(1), spreads, strict=True)
         try:
-            results = [finish(*of_image, options) for of_image in of_images]
+            results = [
+                finish(evidence, members, depth_m, spread, options)
+                for evidence, members, depth_m, spread in maps
+            ]
         finally:  # also where it fails on what is not finite
             self._check_finite()
         return stack_results(

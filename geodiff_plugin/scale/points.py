@@ -219,8 +219,8 @@ def _refine_once(
     # If one end is at its bound, the other end is solved for that.
     moved = bound - ends
     alone = ends - (gradient + normal.flip(2).diagonal(dim1=1, dim2=2) * moved.flip(1)) / (diagonal + 1e-20)
-    settled = torch.where((bound != free).flip(1), alone, bound)
-    return torch.minimum(torch.maximum(settled, bounds[0]), bounds[1])
+    solved = torch.where((bound != free).flip(1), alone, bound)
+    return torch.minimum(torch.maximum(solved, bounds[0]), bounds[1])
 
 
 def _ranks(values: Tensor) -> Tensor:

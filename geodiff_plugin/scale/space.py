@@ -109,19 +109,27 @@ class PriorMaps:
     depth_range: DepthRange | None = None  # a metric prior's
 
 
+class Affine(NamedTuple):
+    """Scale, shift and global scale (metres) of an affine map, all > 0; ``(B,)`` each."""
+
+    scale: Tensor
+    shift: Tensor
+    g_s: Tensor
+
+
 @dataclass(frozen=True)
 class Space:
     """What a prior's output is affine in: ``v = s x + t`` is a function of depth in units of g_s.
 
     ``forward`` gives metres of ``v, g_s``: monotone, linear in ``g_s``, > 0 for every ``v > 0``; ``inverse``
-    is from depth in units of g_s to ``v``; ``from_ends`` gives ``s, t, g_s``, all > 0 and ``s, t`` of order
-    1, of the metres at ``x = 0`` and ``x = 1``.
+    is from depth in units of g_s to ``v``; ``from_ends`` gives the affine map, of scale and shift of order 1,
+    that has given metres at ``x = 0`` and ``x = 1``.
     """
 
     forward: Callable[[Tensor, Tensor], Tensor]
     inverse: Callable[[Tensor], Tensor]
     grows_with_depth: bool
-    from_ends: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+    from_ends: Callable[[Tensor, Tensor], Affine]
 
     def ends(self, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
         """The depths at ``x = 0`` and ``x = 1`` from ``(near, far)``, and the reverse: swapped if x falls."""
@@ -137,29 +145,29 @@ class Space:
         return self.forward(at_zero + (at_one - at_zero) * x, torch.ones_like(at_zero))
 
 
-def _depth_ends(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    return (b - a) / b, a / b, b.clone()
+def _depth_ends(a: Tensor, b: Tensor) -> Affine:
+    return Affine((b - a) / b, a / b, b.clone())
 
 
-def _disparity_ends(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _disparity_ends(a: Tensor, b: Tensor) -> Affine:
     g = torch.sqrt(a * b)
-    return g / b - g / a, g / a, g
+    return Affine(g / b - g / a, g / a, g)
 
 
-def _sqrt_disparity_ends(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _sqrt_disparity_ends(a: Tensor, b: Tensor) -> Affine:
     g = torch.sqrt(a * b)
     t = torch.sqrt(g / a)
-    return torch.sqrt(g / b) - t, t, g
+    return Affine(torch.sqrt(g / b) - t, t, g)
 
 
-def _log_ends(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _log_ends(a: Tensor, b: Tensor) -> Affine:
     g = a * 0.9  # the shift must stay positive: log(a / g) = 0.105
-    return torch.log(b / a), torch.log(a / g), g
+    return Affine(torch.log(b / a), torch.log(a / g), g)
 
 
-def _log1p_ends(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _log1p_ends(a: Tensor, b: Tensor) -> Affine:
     t = torch.log1p(a)
-    return torch.log1p(b) - t, t, torch.ones_like(a)  # the 1 is a metre
+    return Affine(torch.log1p(b) - t, t, torch.ones_like(a))  # the 1 is a metre
 
 
 #: Space in which a prior's output is affine -> its formulas. A new space is one entry.
