@@ -564,7 +564,7 @@ MUTANTS = [
     *of(
         "formats/captures.py",
         ("off_px.max() > ROUNDING_PX", "off_px.max() > 2 * ROUNDING_PX"),
-        ("off_px < NEAR_SIZE * sizes[1]", "off_px < 20 * NEAR_SIZE * sizes[1]"),
+        ("off_px < NEAR_SIZE * expected", "off_px < 20 * NEAR_SIZE * expected"),
         tests=("tests/contracts/test_captures.py",),
     ),
     *of(

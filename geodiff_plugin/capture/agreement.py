@@ -165,8 +165,9 @@ class _Vote(NamedTuple):
 
 
 def _vote(seen_by: Sequence[tuple[np.ndarray, np.ndarray]], mask: np.ndarray) -> _Vote:
-    """What the other frames, ``rendered``, agree on at the ``n`` pixels of a mask."""
-    depths, sures = (np.stack([maps[k][mask] for maps in seen_by]) for k in (0, 1))
+    """What the other frames agree on at the ``n`` pixels of a mask, by their depth and confidence."""
+    depths = np.stack([depth[mask] for depth, _ in seen_by])
+    sures = np.stack([confidence[mask] for _, confidence in seen_by])
     weights = np.where(depths > 0, LEAST_WEIGHT + sures, 0.0)
     inverse = 1.0 / np.where(depths > 0, depths, 1.0)
     best = _Vote(*(np.zeros(depths.shape[1]) for _ in _Vote._fields))

@@ -133,10 +133,12 @@ def _measure_frames(
         true_frames.append(DepthFrame(name, truth, np.ones_like(depth), solved.K[i], solved.E[i]))
         known.append(valid)
     together = [agreed(frame, [other for other in frames if other is not frame]) for frame in frames]
-    scores, checked = (
-        _means([_scores(f.depth, t.depth, k) for f, t, k in zip(which, true_frames, known, strict=True)])
-        for which in (frames, together)
-    )
+
+    def mean_scores(estimated: Sequence[DepthFrame]) -> dict[str, float]:
+        of_frames = zip(estimated, true_frames, known, strict=True)
+        return _means([_scores(frame.depth, true.depth, mask) for frame, true, mask in of_frames])
+
+    scores, checked = mean_scores(frames), mean_scores(together)
     f = f_score(_thin(together, known), _thin(true_frames, known))
     return scores | {"agreed": checked["abs_rel"], "f": f, "tae": temporal_error(together)}
 

@@ -252,20 +252,19 @@ def _turned(frames: Sequence[CaptureFrame]) -> list[Message]:
 
 def _other_sizes(candidates: Sequence[Candidate]) -> list[Message]:
     """What to say of images that are nearly, but not quite, of the size that their cameras are for."""
-    other = []
+    names, sizes = list[str](), ""
     for each in candidates:
         if each.problem or each.camera is None or each.camera.size is None:
             continue
-        sizes = [np.array([float(side) for side in of]) for of in (each.frame.size, each.camera.size)]
-        off_px = np.abs(sizes[0] - sizes[1])
-        if off_px.max() > ROUNDING_PX and (off_px < NEAR_SIZE * sizes[1]).all():
-            other.append(
-                (each.frame.name, "{}x{}".format(*each.frame.size), "{:.0f}x{:.0f}".format(*sizes[1]))
-            )
-    if not other:
+        got, expected = (np.array(size, float) for size in (each.frame.size, each.camera.size))
+        off_px = np.abs(got - expected)
+        if off_px.max() > ROUNDING_PX and (off_px < NEAR_SIZE * expected).all():
+            names.append(each.frame.name)
+            image, camera = ("{:.0f}x{:.0f}".format(*size) for size in (got, expected))
+            sizes = sizes or f"an image of {image} where its camera is for {camera}"
+    if not names:
         return []
-    _, got, expected = other[0]
-    said = f"{_some([name for name, *_ in other])}: an image of {got} where its camera is for {expected}"
+    said = f"{_some(names)}: {sizes}"
     cure = "Is it the one before its lens distortion was removed? Then say where the others lie (--images)."
     return [Message("capture.other-size", f"{said}. {cure}")]
 
@@ -278,7 +277,9 @@ def _reasons(candidates: Sequence[Candidate]) -> list[Message]:
             names.setdefault(each.problem, []).append(each.frame.name)
     reasons = [f"{_some(those)}: {why.rstrip('.')}; {len(those)} skipped." for why, those in names.items()]
     more = sum(map(len, list(names.values())[MOST_REASONS:]))
-    reasons = reasons[:MOST_REASONS] + [f"{more} more skipped for like reasons."] * (more > 0)
+    reasons = reasons[:MOST_REASONS]
+    if more:
+        reasons.append(f"{more} more skipped for like reasons.")
     return [Message("capture.skipped", reason) for reason in reasons]
 
 

@@ -295,7 +295,10 @@ def _models_below(path: Path) -> Iterator[list[Files]]:
             yield [files]
         return
     for place in PLACES:
-        folders = sorted(at for pattern in place for at in ([path] if not pattern else path.glob(pattern)))
+        folders: list[Path] = []
+        for pattern in place:
+            folders += path.glob(pattern) if pattern else [path]
+        folders.sort()
         if models := [files for files in map(model_files, folders) if files]:
             yield models
 

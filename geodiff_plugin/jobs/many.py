@@ -212,9 +212,9 @@ def depth_pairs(
     """
     assert options.out is not None
     _refuse_one_length(options, refs)
-    shard, device, _ = Shard.of(options.shard), pick_device(options.device), options.config()
-    if device.type == "cuda" and device.index is None:
-        device = torch.device("cuda", shard.local % torch.cuda.device_count())
+    shard = Shard.of(options.shard)
+    device = _device_of(options, shard)
+    options.config()  # refuses options that contradict each other before anything is written
     if options.steady and not shard.whole:
         refuse("--steady needs all frames: run the shards without it, then the whole with it.")
     refs = shard.part(refs)
@@ -226,10 +226,9 @@ def depth_pairs(
                 pairs_to_folders = imported("jobs.cluster.pairs_to_folders")
                 records = pairs_to_folders(options, items, journal, progress=progress)
             else:
-                runner = Runner(items, journal, noun="pair", survives=(Exception,), progress=progress)
                 left = sum(journal.get(item) is None for item in items)
-                processes = shard.processes_here(torch.cuda.device_count())
-                writers = count_writers(device, left, processes)
+                writers = count_writers(device, left, shard.processes_here(torch.cuda.device_count()))
+                runner = Runner(items, journal, noun="pair", survives=(Exception,), progress=progress)
                 records = _through(Stages(options, device, pipe, tell=tell, writers=writers), runner)
         rows = [_final(record, there.get(record["key"]), options, tell) for record in records]
         write_table(shard.path(options.out / SUMMARY), rows, tell)
@@ -239,6 +238,14 @@ def depth_pairs(
                 whole = [ref for ref in refs if ref.name not in failed]
                 write_steady_frames(options, whole, views.of, tell)
     return rows
+
+
+def _device_of(options: DepthOptions, shard: Shard) -> torch.device:
+    """The device that the options name; of several GPUs that of the shard."""
+    device = pick_device(options.device)
+    if device.type == "cuda" and device.index is None:
+        return torch.device("cuda", shard.local % torch.cuda.device_count())
+    return device
 
 
 def _rows_there(items: Sequence[Item], options: DepthOptions, journal: Journal) -> dict[str, Row]:

@@ -232,8 +232,10 @@ class DepthOptions(SpeedOptions, RunOptions):
 
     def read_files(self) -> list[Path]:
         """Every file that a run reads; of a COLMAP model its texts."""
-        paths = [*self.photographs().values(), *(path for _, path in self.other_files())]
-        return [f for p in paths for f in ([p / name for name in MODEL_FILES] if p.is_dir() else [p])]
+        files: list[Path] = []
+        for path in (*self.photographs().values(), *(path for _, path in self.other_files())):
+            files += [path / name for name in MODEL_FILES] if path.is_dir() else [path]
+        return files
 
     def refuse(self, names: Iterable[str], sentence: str) -> None:
         """Refuse the first of these options that was given; ``{}`` in the sentence stands for its flag."""

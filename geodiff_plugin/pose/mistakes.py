@@ -208,7 +208,8 @@ def exchangeable(
         seen = tracks.view(v)
         if len(seen) < FEWEST:
             continue
-        undone = max(_fine_share(each, T) for each in _exchanged(seen, sizes[0], sizes[v + 1]) for T in poses)
+        exchanged = list(_exchanged(seen, sizes[0], sizes[v + 1]))
+        undone = max(_fine_share(each, T) for T in poses for each in exchanged)
         as_it_is = _fine_share(seen, near[v])
         shares.append(min(1.0, undone / as_it_is) if as_it_is > 0 else 1.0)
     return min(shares, default=math.nan)
@@ -218,8 +219,6 @@ def _exchanged(tracks: Tracks, left: tuple[int, ...], right: tuple[int, ...]) ->
     """Tracks of one right view with the pictures exchanged, mirrored, and turned by 180 degrees."""
     yield replace(tracks, left_px=tracks.right_px[0], right_px=tracks.left_px[None])
     for turned in (np.array([True, False]), np.array([True, True])):
-        pixels = (
-            np.where(turned, np.array(size[::-1]) - 1.0 - px, px)
-            for size, px in ((left, tracks.left_px), (right, tracks.right_px))
-        )
-        yield replace(tracks, left_px=next(pixels), right_px=next(pixels))
+        left_px = np.where(turned, np.array(left[::-1]) - 1.0 - tracks.left_px, tracks.left_px)
+        right_px = np.where(turned, np.array(right[::-1]) - 1.0 - tracks.right_px, tracks.right_px)
+        yield replace(tracks, left_px=left_px, right_px=right_px)

@@ -253,8 +253,12 @@ def _aligned(result: SolvedCapture, E_given: np.ndarray, scale: float) -> Solved
     centres, given = result.E[:, :3, 3], E_given[:, :3, 3]
     # Directions of view count three times as much as places: places on a line leave a turn about it open.
     reach = 3.0 * float(np.median(np.linalg.norm(given - np.median(given, axis=0), axis=1)))
-    known = (scale * centres, result.E), (given, E_given)
-    _, Q = _similarity(*(np.concatenate([c, *(c + reach * E[:, :3, k] for k in range(3))]) for c, E in known))
+
+    def with_directions(places: np.ndarray, E: np.ndarray) -> np.ndarray:
+        """Places ``(N, 3)``, and the points that lie before them along the axes of each camera."""
+        return np.concatenate([places, *(places + reach * E[:, :3, axis] for axis in range(3))])
+
+    _, Q = _similarity(with_directions(scale * centres, result.E), with_directions(given, E_given))
     turned = scale * centres @ Q.T
     shift = np.median(given - turned, axis=0)
     E = result.E.copy()
