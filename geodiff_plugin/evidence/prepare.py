@@ -23,7 +23,7 @@ from geodiff_plugin.matching.matches import read_above
 from geodiff_plugin.matching.rows import RowMatches, RowPictures, match_rows, rectified_pictures
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.pose.refine import PoseFit, measure_fit, refine_views, unchecked
+from geodiff_plugin.pose.refine import PoseFit, measure_fit, refine_views, report_as_given
 from geodiff_plugin.scale.points import RELIABLE, reliable_matches
 from geodiff_plugin.types import PosedViews
 
@@ -55,7 +55,7 @@ def make_evidence(
         return prepare_evidence(posed, points, config)
     if config.pose == "given":
         posed = _with_clean_images(posed, config)
-        report = Beside.known(unchecked(posed.views))
+        report = Beside.known(report_as_given(posed.views))
         return replace(prepare_evidence(posed, points, config), report=report)
     clear, measured = _measured_beside(posed, config)
     evidence = None

@@ -31,7 +31,7 @@ class ProcessEnded(InputError):
 
 
 @dataclass(frozen=True)
-class _Told:
+class _Outcome:
     """What became of a call: its answer or its error, and what it warned of."""
 
     answer: Any = None
@@ -75,16 +75,16 @@ class SeparateProcess:
         try:
             pickle.dump((function, args), self._process.stdin, protocol=5)  # arrays are written uncopied
             self._process.stdin.flush()
-            told: _Told = pickle.load(self._process.stdout)
+            outcome: _Outcome = pickle.load(self._process.stdout)
         except (OSError, EOFError, pickle.UnpicklingError) as error:
             ended = f"A process that writes results has ended (exit code {self._process.wait()})."
             cure = "Is there enough memory? Finished results stay; the same command goes on with the rest."
             raise ProcessEnded(f"{ended} {cure}") from error
-        for message in told.warned:
+        for message in outcome.warned:
             warn(message)
-        if told.error is not None:
-            raise told.error
-        return told.answer
+        if outcome.error is not None:
+            raise outcome.error
+        return outcome.answer
 
     def leave(self) -> None:
         """Let it end once it has done what it is at."""
@@ -130,24 +130,24 @@ class SeparateProcesses:
 def serve() -> None:
     """Do what standard input asks for until it ends, and answer on standard output."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    asked, answers = open(0, "rb"), os.fdopen(os.dup(1), "wb")
+    requests, answers = open(0, "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints is no answer
     with collected_warnings(silent):  # the process that asks tells them
-        while asked.peek(1):
-            pickle.dump(_answer(asked), answers, protocol=5)
+        while requests.peek(1):
+            pickle.dump(_answer(requests), answers, protocol=5)
             answers.flush()
 
 
-def _answer(asked: BufferedReader) -> _Told:
+def _answer(requests: BufferedReader) -> _Outcome:
     """Read one call and do it."""
     answer, error = None, None
     with noted() as warned:
         try:
-            function, args = pickle.load(asked)
+            function, args = pickle.load(requests)
             answer = function(*args)
         except Exception as raised:
             error = _sendable(raised)
-    return _Told(answer, error, tuple(warned))
+    return _Outcome(answer, error, tuple(warned))
 
 
 def _sendable(error: Exception) -> Exception:

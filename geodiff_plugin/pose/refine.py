@@ -91,8 +91,8 @@ class CheckedViews(NamedTuple):
     report: PoseReport
 
 
-def unchecked(rights: Sequence[CameraView], status: str = "given") -> PoseReport:
-    """The report of poses that are used as they were given, without a check."""
+def report_as_given(rights: Sequence[CameraView], status: str = "given") -> PoseReport:
+    """The report of poses that are used as they were given, with nothing that was measured."""
     poses = _as_E(_poses(rights))
     return PoseReport(status, poses, poses)
 
@@ -154,13 +154,12 @@ def refine_views(posed: PosedViews, fit: PoseFit, measured: bool = False) -> Che
     """
     rights, sparse, given, before = posed.views, fit.tracks, fit.given, fit.residual_px
     if not fit.is_known:
-        return CheckedViews(rights, unchecked(rights, "not checked"))
-    residual_px, poses = tuple(before.tolist()), _as_E(given)
-    matches = tuple(map(float, sparse.seen.sum(1)))
-    report = PoseReport("fits", poses, poses, residual_px, residual_px, matches)
+        return CheckedViews(rights, report_as_given(rights, "not checked"))
     near = given if fit.fits else nearby_poses(sparse, given, before)
     greys = [grey for grey, _ in fit.views]
-    report = _with_contradictions(_with_pictures(report, posed, greys), sparse, given)
+    report = _with_residuals(report_as_given(rights, "fits"), sparse, before)
+    report = _with_pictures(report, posed, greys)
+    report = _with_contradictions(report, sparse, given)
     report = replace(report, exchangeable=exchangeable(sparse, given, near, [grey.shape for grey in greys]))
     if mistakes := _messages(sparse, find_mistake, given, near):
         return CheckedViews(rights, replace(report, status="mistaken", warnings=mistakes))
@@ -168,13 +167,19 @@ def refine_views(posed: PosedViews, fit: PoseFit, measured: bool = False) -> Che
         return CheckedViews(rights, report)
     depth_m = coarse_depth(posed._replace(views=_applied(rights, near)), greys[0].shape)
     tracks = merge_tracks([sparse, dense_tracks(fit.views, depth_m, near)])
-    if fit.rig and not ((all_px := median_residuals(tracks, given)) > fit.limit_px).any():
-        # The few sparse matches missed by chance: a calibration is not changed for what all do not show.
-        residual_px, matches = tuple(all_px.tolist()), tuple(map(float, tracks.seen.sum(1)))
-        report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
-        return CheckedViews(rights, report)
+    if fit.rig:
+        by_all = median_residuals(tracks, given)
+        if not (by_all > fit.limit_px).any():
+            # The few sparse matches missed by chance: a calibration is not changed for what all do not show.
+            return CheckedViews(rights, _with_residuals(report, tracks, by_all))
     sizes = [(image.shape[0], image.shape[1]) for image in greys[1:]]
     return _refined(_Misfit(rights, sizes, tracks, given, near, fit.limit_px, fit.rig, measured), report)
+
+
+def _with_residuals(report: PoseReport, tracks: Tracks, residual_px: np.ndarray) -> PoseReport:
+    """The report with the residuals ``(V,)`` of these tracks under the given poses, which are in use."""
+    residuals, matches = tuple(residual_px.tolist()), tuple(map(float, tracks.seen.sum(1)))
+    return replace(report, residual_px_given=residuals, residual_px=residuals, matches=matches)
 
 
 def _with_pictures(report: PoseReport, posed: PosedViews, greys: Sequence[np.ndarray]) -> PoseReport:
@@ -205,11 +210,11 @@ def _refined(misfit: _Misfit, report: PoseReport) -> CheckedViews:
     rights, tracks, given = misfit.rights, misfit.tracks, misfit.given
     before = median_residuals(tracks, given)
     Ts, free = regularised_poses(tracks, given, misfit.near, before, misfit.rig)
-    after, worst = median_residuals(tracks, Ts), int(np.argmax(np.nan_to_num(before)))
-    residual_px, matches = tuple(before.tolist()), tuple(map(float, tracks.seen.sum(1)))
-    report = replace(report, residual_px_given=residual_px, residual_px=residual_px, matches=matches)
+    after = median_residuals(tracks, Ts)
+    worst = int(np.argmax(np.nan_to_num(before)))
     apart = 0.0 if misfit.rig else depths_apart(tracks, Ts, free)  # a calibration determines the pose
-    report, doubts = replace(report, depth_spread=apart), _undetermined(apart)
+    doubts = _undetermined(apart)
+    report = replace(_with_residuals(report, tracks, before), depth_spread=apart)
     if not np.nanmean(after) < (1.0 - _LEAST_GAIN) * np.nanmean(before):
         warnings = _kept_misfit(before, worst) + doubts
         return CheckedViews(rights, replace(report, status="kept", warnings=warnings))
