@@ -64,6 +64,31 @@ class Command(NamedTuple):
     about: str
 
 
+@dataclass(frozen=True)
+class OptionRules:
+    """What ``declare`` says of an option, beside the name, the type and the default of its field."""
+
+    help: str
+    flags: tuple[str, ...]  # as typed; empty for ``--name-with-dashes``
+    panel: str  # its group in ``--help``
+    low: float | None  # least value of a number
+    high: float | None
+    above_0: str  # the unit of a number that is finite and above 0; empty for other options
+    choices: tuple[str, ...]  # empty for any value
+    split: bool  # whether a tuple is typed with commas; otherwise its option is repeated
+    metavar: str | None  # what it takes, in a word; ``None`` for the word of its type
+
+    @property
+    def is_argument(self) -> bool:
+        """Whether it is typed without a name."""
+        return self.flags == ("",)
+
+
+def rules_of(field: Field[Any]) -> OptionRules | None:
+    """The rules of an option; ``None`` for a field that ``declare`` did not make."""
+    return field.metadata.get("rules")
+
+
 def imported(where: str) -> Any:
     """Something of this package by its dotted name (``cli.info.run_info``), imported now."""
     module, _, name = where.rpartition(".")
@@ -88,36 +113,41 @@ def declare(
     number lies between ``low`` and ``high``, or is finite and above 0, in the unit ``above_0``. A tuple is
     typed with commas where ``split``, otherwise its option is repeated.
     """
-    metadata = {"help": help_text, "flags": flags, "panel": panel, "split": split, "metavar": metavar}
-    metadata |= {"low": low, "high": high, "above_0": above_0, "choices": choices}
-    return dataclasses.field(default=default, metadata=metadata)
+    rules = OptionRules(help_text, flags, panel, low, high, above_0, choices, split, metavar)
+    return dataclasses.field(default=default, metadata={"rules": rules})
 
 
 def flag_of(field: Field[Any]) -> str:
     """How an option is typed: ``--min-confidence``, or ``LEFT`` for an argument."""
-    flags = field.metadata.get("flags") or (f"--{field.name.replace('_', '-')}",)
-    return flags[0] or field.name.upper()
+    rules = rules_of(field)
+    if rules is None or not rules.flags:
+        return f"--{field.name.replace('_', '-')}"
+    return field.name.upper() if rules.is_argument else rules.flags[0]
 
 
 def help_of(name: str) -> str:
     """The sentence that says what an option of ``RunOptions`` is."""
-    text: str = RunOptions.__dataclass_fields__[name].metadata["help"]
-    return text
+    rules = rules_of(RunOptions.__dataclass_fields__[name])
+    assert rules is not None
+    return rules.help
 
 
 def check_options(options: Any, name_of: Callable[[Field[Any]], str] = flag_of) -> None:
     """Hold every value of a dataclass of options against what its field declares, if ``declare`` made it."""
     for field in dataclasses.fields(options):
-        rules, value, name = field.metadata, getattr(options, field.name), name_of(field)
+        rules, value, name = rules_of(field), getattr(options, field.name), name_of(field)
+        if rules is None:
+            continue
         for entry in value if isinstance(value, tuple) else (value,):
-            if entry is None or not rules:
+            if entry is None:
                 continue
-            if rules["choices"]:
-                check_choice(entry, name, rules["choices"])
-            if rules["low"] is not None:
-                check_number(entry, name, rules["low"], rules["high"], integer="int" in str(field.type))
-            if rules["above_0"]:
-                check_positive(entry, name, rules["above_0"])
+            if rules.choices:
+                check_choice(entry, name, rules.choices)
+            if rules.low is not None:
+                assert rules.high is not None
+                check_number(entry, name, rules.low, rules.high, integer="int" in str(field.type))
+            if rules.above_0:
+                check_positive(entry, name, rules.above_0)
 
 
 def workers_option() -> Any:

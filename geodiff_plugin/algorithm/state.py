@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import accumulate, groupby
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -50,6 +51,13 @@ def chunk_views(evidence: Sequence[Evidence]) -> PosedViews:
     return PosedViews(left_01, tuple(further), K_left)
 
 
+class StepTime(NamedTuple):
+    """Which denoising step it is."""
+
+    number: int  # in the schedule, from 0
+    timestep: float  # the scheduler's
+
+
 class Trajectory:
     """State of one chunk of samples through the schedule.
 
@@ -90,11 +98,11 @@ class Trajectory:
         self._affine_start: AffineState | None = None  # the search's result, which the loss pulls towards
         self.history: list[StepReport] = []
         self.watch = FiniteWatch()
-        self.step: tuple[int, float] = (0, 0.0)
+        self.step = StepTime(0, 0.0)
 
     def note(self, name: str, tensor: Tensor) -> None:
         """Remember whether a tensor of this step is finite."""
-        self.watch.note(name, self.step[0], tensor)
+        self.watch.note(name, self.step.number, tensor)
 
     def prepare(self, x: Tensor, z0: Tensor) -> None:
         """Find the scale of an estimate ``x``, decoded from ``z0``; at the first one judge the matches."""

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping
 from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, cast, get_args, get_origin, get_type_hints
 
 import typer
 import typer.main
@@ -18,7 +18,16 @@ from geodiff_plugin.cli.terminal import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_T
 from geodiff_plugin.jobs.memory import CURE, is_out_of_memory
 from geodiff_plugin.jobs.stopping import Terminated, ending_on_sigterm
 from geodiff_plugin.jobs.telling import say
-from geodiff_plugin.options import OTHERS, OUTPUT, PANELS, Command, check_options, flag_of
+from geodiff_plugin.options import (
+    OTHERS,
+    OUTPUT,
+    PANELS,
+    Command,
+    OptionRules,
+    check_options,
+    flag_of,
+    rules_of,
+)
 
 APPEARANCE: dict[str, Any] = {
     "add_completion": False,
@@ -94,40 +103,56 @@ def _built(name: str, command: Command) -> Any:
     if command.options is None:
         return typer.main.get_command(command.run(None))
     options, kinds = command.options, get_type_hints(command.options)
-    known = [field for field in dataclasses.fields(options) if field.metadata]
-    known.sort(key=lambda f: (flag_of(f)[0] == "-", PANELS.index(f.metadata["panel"])))
+    known = _in_order(options)
 
     def call(**typed: Any) -> None:
-        made = options(**{f.name: _value(f, typed[f.name], kinds[f.name]) for f in known})
+        values = {
+            field.name: _value(field, rules, typed[field.name], kinds[field.name])
+            for field, rules in known.items()
+        }
+        made = options(**values)
         check_options(made)
         command.run(made)
 
-    vars(call)["__signature__"] = Signature([_parameter(field, kinds[field.name]) for field in known])
+    parameters = [_parameter(field, rules, kinds[field.name]) for field, rules in known.items()]
+    vars(call)["__signature__"] = Signature(parameters)
     single = typer.Typer(**APPEARANCE)
     single.command(name, cls=_Single, help=command.about)(call)
     return typer.main.get_command(single)
 
 
-def _parameter(field: dataclasses.Field[Any], kind: Any) -> Parameter:
+def _in_order(options: type) -> dict[dataclasses.Field[Any], OptionRules]:
+    """The options that are declared, with their rules: arguments first, then group by group."""
+    known = {field: rules for field in dataclasses.fields(options) if (rules := rules_of(field)) is not None}
+
+    def place(field: dataclasses.Field[Any]) -> tuple[bool, int]:
+        return not known[field].is_argument, PANELS.index(known[field].panel)
+
+    return {field: known[field] for field in sorted(known, key=place)}
+
+
+def _parameter(field: dataclasses.Field[Any], rules: OptionRules, kind: Any) -> Parameter:
     """An option or argument of typer for a field of a dataclass of options."""
-    rules, required = field.metadata, field.default is dataclasses.MISSING
-    default: Any = field.default
-    flags, metavar = rules["flags"] or (flag_of(field),), rules["metavar"]
-    about = {"metavar": _metavar(kind) if metavar is None else metavar, "help": rules["help"]}
-    if rules["split"]:
+    required, default = field.default is dataclasses.MISSING, cast(Any, field.default)
+    about: dict[str, Any] = {
+        "metavar": _metavar(kind) if rules.metavar is None else rules.metavar,
+        "help": rules.help,
+    }
+    if rules.split:
         if default:  # in the sentence: lines of help break at blanks alone, and it is typed without them
-            listed = "all" if set(default) == set(rules["choices"]) else ", ".join(map(str, default))
-            about["help"] = f"{rules['help'].removesuffix('.')} (default: {listed})."
+            listed = "all" if set(default) == set(rules.choices) else ", ".join(map(str, default))
+            about["help"] = f"{rules.help.removesuffix('.')} (default: {listed})."
         kind, default = str | None, ",".join(map(str, default)) or None
     elif get_origin(kind) is tuple:
         kind = list[get_args(kind)[0]]  # type: ignore[misc]
         kind, default = (kind, default) if required else (kind | None, list(default) or None)
     elif _number(kind):  # read by _value, which says what was typed
         kind, default = str | None, default if required or default is None else str(default)
-    if flags == ("",):
+    if rules.is_argument:
         typed: Any = typer.Argument(**about)
     else:
-        typed = typer.Option(*flags, **about, rich_help_panel=rules["panel"], show_default=not rules["split"])
+        flags = rules.flags or (flag_of(field),)
+        typed = typer.Option(*flags, **about, rich_help_panel=rules.panel, show_default=not rules.split)
     default = Parameter.empty if required else default
     return Parameter(field.name, Parameter.KEYWORD_ONLY, annotation=Annotated[kind, typed], default=default)
 
@@ -143,9 +168,9 @@ def _number(kind: Any) -> Any:
     return next((number for number in NUMBERS if number in (kind, *get_args(kind))), None)
 
 
-def _value(field: dataclasses.Field[Any], value: Any, kind: Any) -> Any:
+def _value(field: dataclasses.Field[Any], rules: OptionRules, value: Any, kind: Any) -> Any:
     """What was typed, as the field has it."""
-    if field.metadata["split"]:
+    if rules.split:
         parts = [part.strip() for part in (value or "").split(",") if part.strip()]
         if get_args(kind)[0] is int and not all(part.isdecimal() for part in parts):
             bad_value(flag_of(field), "whole numbers, comma-separated", repr(value))

@@ -25,6 +25,7 @@ from geodiff_plugin.options import (
     flag_of,
     gpus_option,
     imported,
+    rules_of,
     workers_option,
 )
 
@@ -299,28 +300,21 @@ COMMANDS = {
 }
 
 
+#: Options that change no number of a page.
+CHANGE_NO_NUMBER = frozenset(
+    {"out", "results", "quiet", "skip_broken", "stop_on_broken", "save_depth", "engine", "workers", "gpus"}
+)
+
+
 def command_line(name: str, options: Any) -> str:
     """The command line that gives these options, defaults and what changes no number left out."""
-    words, without = (
-        [*options.program.split(), name],
-        (
-            "out",
-            "results",
-            "quiet",
-            "skip_broken",
-            "stop_on_broken",
-            "save_depth",
-            "engine",
-            "workers",
-            "gpus",
-        ),
-    )
+    words = [*options.program.split(), name]
     for each in fields(options):
-        value, rules = getattr(options, each.name), each.metadata
-        if not rules or each.name in without or value == each.default:
+        value, rules = getattr(options, each.name), rules_of(each)
+        if rules is None or each.name in CHANGE_NO_NUMBER or value == each.default:
             continue
-        flag = [flag_of(each)] if rules["flags"] != ("",) else []
-        entries = value if isinstance(value, tuple) and not rules["split"] else (value,)
+        flag = [] if rules.is_argument else [flag_of(each)]
+        entries = value if isinstance(value, tuple) and not rules.split else (value,)
         for entry in entries:
             text = ",".join(map(str, entry)) if isinstance(entry, tuple) else str(entry)
             words += flag + ([] if entry is True else [text])

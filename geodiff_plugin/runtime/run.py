@@ -14,7 +14,7 @@ from tqdm.auto import tqdm
 from geodiff_plugin._checks import bad_type, bad_value
 from geodiff_plugin.algorithm.member import Member
 from geodiff_plugin.algorithm.schedule import Schedule, make_schedule
-from geodiff_plugin.algorithm.state import Trajectory
+from geodiff_plugin.algorithm.state import StepTime, Trajectory
 from geodiff_plugin.algorithm.step import guided_step
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.guidance import SAME_CENTRE, GeometryGuidance
@@ -191,7 +191,7 @@ class GuidedRun:
                 self._plan.step_latents,
             )
             if self._first_output is not None:
-                trajectory.step = 0, self._timesteps[0]
+                trajectory.step = StepTime(0, self._timesteps[0])
                 trajectory.note("the prior's output", self._first_output)
             self.trajectories.append(trajectory)
         return self.trajectories[self._chunk]
@@ -210,7 +210,7 @@ class GuidedRun:
             level = noise_level(self.pipe.scheduler, timestep)
             estimate = StepEstimate(self._codec, level, output, z_t, self._tap, latent_is_read)
             trajectory = self._trajectory()
-            trajectory.step = self._step, self._timesteps[self._step]
+            trajectory.step = StepTime(self._step, self._timesteps[self._step])
             with torch.autocast(z_t.device.type, enabled=False):  # bfloat16 cannot tell column 761 from 762
                 step = guided_step(trajectory, estimate, rounds, is_last)
             self._shown = step.relative

@@ -16,7 +16,7 @@ from PIL import Image
 
 from geodiff_plugin.cli.app import COMMANDS
 from geodiff_plugin.formats.reading import CALIBRATION_FORMATS
-from geodiff_plugin.options import DTYPES, PRESETS, SPACES
+from geodiff_plugin.options import DTYPES, PRESETS, SPACES, rules_of
 from tests.cli.conftest import never
 
 TABLE = Path(__file__).with_name("bad_input.txt")
@@ -167,7 +167,7 @@ def test_names_that_are_known_without_torch_are_those_with_it():
     assert set(SPACES) == set(space.SPACES) and set(PRESETS) <= set(CONFIGS)
     assert all(isinstance(getattr(torch, name), torch.dtype) for name in DTYPES)
     submit = COMMANDS["submit"][0].__dataclass_fields__["to"]
-    assert set(submit.metadata["choices"]) == set(BENCHMARKS)
+    assert set(rules_of(submit).choices) == set(BENCHMARKS)
 
 
 def test_help_imports_neither_torch_nor_numpy():

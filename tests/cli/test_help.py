@@ -6,6 +6,7 @@ import pytest
 
 from geodiff_plugin.cli.app import COMMANDS, main
 from geodiff_plugin.evaluation.options import COMMANDS as EVALUATIONS
+from geodiff_plugin.options import rules_of
 
 #: Lines of a terminal that has 80 columns, with some to spare.
 SCREEN_LINES = 30
@@ -37,8 +38,9 @@ def test_help_of_depth_begins_with_what_is_given_most_and_has_every_option(capsy
     assert titles[:3] == ["Arguments", "Cameras", "Output"]
     assert len(titles) == len(set(titles))
     for field in COMMANDS["depth"].options.__dataclass_fields__.values():
-        if field.metadata and field.metadata["flags"] != ("",):
-            flags = field.metadata["flags"] or (f"--{field.name.replace('_', '-')}",)
+        rules = rules_of(field)
+        if rules and not rules.is_argument:
+            flags = rules.flags or (f"--{field.name.replace('_', '-')}",)
             assert len(re.findall(rf"^│ {flags[0]}(?= )", text, re.MULTILINE)) == 1, flags
 
 

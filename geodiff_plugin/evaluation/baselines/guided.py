@@ -288,8 +288,8 @@ class RampPrior(DepthMapPipeline):
 def _run_ramp(preset: Preset, sample: StereoSample, settings: Settings, priors: PriorCache) -> Prediction:
     """A guided call on a ramp, with as many rounds of updates as the preset makes with this prior."""
     pipe = priors.get(settings)
-    adapter, asked = prior_of(pipe), preset(*posed_views(sample, settings.views))
-    rounds = asked.denoising_steps(settings.steps, pipe.default_denoising_steps)
+    adapter, of_preset = prior_of(pipe), preset(*posed_views(sample, settings.views))
+    rounds = of_preset.denoising_steps(settings.steps, pipe.default_denoising_steps)
     ramp = RampPrior(DirectScheduler(), adapter.space, rounds, pipe.default_processing_resolution or 0)
     ramp.adapter, ramp.image_processor = adapter, pipe.image_processor
     ramp.to(pipe.device).set_progress_bar_config(disable=True)
