@@ -54,8 +54,8 @@ def make_schedule(
     Early estimates are vague, and later corrections replace what earlier ones did. So the last active round
     is corrected, and the others are spread over the second half of the active rounds, or over more of them if
     they do not fit there. An estimate that was corrected in a round without updates is not corrected again in
-    the same step: a second fit to the same matches would follow their noise. Nothing is
-    corrected unless a map can be encoded (``encodes``), which it cannot while guidance moves z_t.
+    the same step: a second fit to the same matches would follow their noise. Nothing is corrected unless a
+    map can be encoded (``encodes``), which it cannot while guidance moves z_t.
     """
     count = steps * rounds
     active = [i for i in range(count) if config.start <= i / count < config.stop]

@@ -274,10 +274,9 @@ class SharedErrors(NamedTuple):
 def split_residuals(tracks: Tracks, T: np.ndarray) -> SharedErrors:
     """Split the residuals of matches into noise of their own and errors that neighbours share.
 
-    Such errors
-    are those that no pose explains (rolling shutter, lens distortion, K); with them many matches determine a
-    pose no better than a few. The means of blocks of the image show them: the mean of
-    ``n`` independent residuals has ``1 / n`` of their variance. ``T (4, 4)`` fits tracks of one right view.
+    Such errors are those that no pose explains (rolling shutter, lens distortion, K); with them many matches
+    determine a pose no better than a few. The means of blocks of the image show them: the mean of ``n``
+    independent residuals has ``1 / n`` of their variance. ``T (4, 4)`` fits tracks of one right view.
     """
     off = epipolar(tracks, T).off_px
     scale = max(1.4826 * float(np.median(np.abs(off))), 1e-3)
