@@ -25,21 +25,39 @@ MOST_SIZES = 8
 HALF = (torch.float16, torch.bfloat16)
 
 
-class _Graph:
-    """A recorded forward: the tensors that it reads, and those that it writes."""
+@functools.cache
+def _recording_stream(device: torch.device) -> torch.cuda.Stream:
+    """One for all graphs of a device: torch's own is of the device that is the current one at its first use.
 
-    def __init__(self, forward: Callable[..., Any], args: list[Any], kwargs: dict[str, Any]) -> None:
+    What is launched on another device than that of the stream is not recorded, and no replay repeats it.
+    """
+    return torch.cuda.Stream(device)
+
+
+class _Graph:
+    """A recorded forward on a device: the tensors that it reads, and those that it writes."""
+
+    def __init__(
+        self, forward: Callable[..., Any], args: list[Any], kwargs: dict[str, Any], device: torch.device
+    ) -> None:
         self._inputs = [value.clone() for value in _tensors(args, kwargs)]
+        self._latest = torch.cuda.current_stream(device)  # what it read and wrote last, it did there
         fixed = iter(self._inputs)
         args = [next(fixed) if isinstance(value, Tensor) else value for value in args]
         kwargs = {k: next(fixed) if isinstance(v, Tensor) else v for k, v in kwargs.items()}
-        self._graph = torch.cuda.CUDAGraph()
-        # Another thread, which prepares the next pair, may use the device meanwhile.
-        with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
-            self._output = forward(*args, **kwargs)
+        with torch.cuda.device(device):
+            self._graph = torch.cuda.CUDAGraph()
+            # Another thread, which prepares the next pair, may use the device meanwhile.
+            how = {"stream": _recording_stream(device), "capture_error_mode": "thread_local"}
+            with torch.cuda.graph(self._graph, **how):
+                self._output = forward(*args, **kwargs)
 
     def replay(self, args: list[Any], kwargs: dict[str, Any]) -> Any:
         """The output for other inputs of the same sizes, as a copy: the next replay writes over it."""
+        stream = torch.cuda.current_stream(self._latest.device)
+        if stream != self._latest:  # that of another thread: it must not write over what is still read
+            stream.wait_stream(self._latest)
+            self._latest = stream
         for fixed, value in zip(self._inputs, _tensors(args, kwargs), strict=True):
             fixed.copy_(value)
         self._graph.replay()
@@ -97,7 +115,7 @@ class GraphedForward:
                     self._graphs[key] = None
                 return output
             device = next(self._network.parameters()).device
-            graph = self._graphs[key] = _Graph(forward, *_on(device, args, kwargs))
+            graph = self._graphs[key] = _Graph(forward, *_on(device, args, kwargs), device)
         return graph.replay(list(args), kwargs)
 
     def _key(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:

@@ -1,5 +1,8 @@
 """``enable_geometry_guidance(graphs=..., kernels=...)``: what changes, and that it changes back."""
 
+from contextlib import contextmanager
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -7,6 +10,7 @@ from geodiff_plugin import disable_geometry_guidance, enable_geometry_guidance
 from geodiff_plugin._checks import InputError
 from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.runtime import graphs
 from geodiff_plugin.runtime.graphs import GraphedForward
 from tests.tiny import guided_call, make_marigold, seeded
 
@@ -88,6 +92,58 @@ def test_calls_share_a_graph_only_where_all_but_the_values_is_equal():
         assert key(2, 3, return_dict=False) != key(2, 3, return_dict=True)
         assert key(2, 3, anything=object()) is None
     assert key(2, 3) is None  # a gradient may be needed
+
+
+class Stream:
+    """A stream of a made-up card, which notes what it waits for."""
+
+    def __init__(self, device, name="recording"):
+        self.device, self.name, self.waited = torch.device(device), name, []
+
+    def wait_stream(self, other):
+        self.waited.append(other.name)
+
+
+@pytest.fixture
+def two_cards(monkeypatch):
+    """Two made-up cards, of which the first is the current one; what is recorded, and on which of them."""
+    graphs._recording_stream.cache_clear()
+    now = SimpleNamespace(device=torch.device("cuda", 0), stream=Stream("cuda:1", "main"), recorded=[])
+
+    @contextmanager
+    def on(device):
+        before, now.device = now.device, device
+        yield
+        now.device = before
+
+    @contextmanager
+    def recorded(graph, *, stream, capture_error_mode):
+        now.recorded.append((now.device, stream.device, capture_error_mode))
+        yield
+
+    monkeypatch.setattr(torch.cuda, "device", on)
+    monkeypatch.setattr(torch.cuda, "graph", recorded)
+    monkeypatch.setattr(torch.cuda, "Stream", Stream)
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: SimpleNamespace(replay=lambda: None))
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: now.stream)
+    yield now
+    graphs._recording_stream.cache_clear()
+
+
+def test_a_network_is_recorded_on_its_own_card_and_not_on_the_current_one(two_cards):
+    """torch records on a stream of the current card by default, and what runs on another is not recorded."""
+    graphs._Graph(lambda x: x + 1, [torch.zeros(2)], {}, torch.device("cuda", 1))
+    assert two_cards.recorded == [(torch.device("cuda", 1),) * 2 + ("thread_local",)]
+
+
+def test_a_replay_on_another_stream_waits_for_the_one_before(two_cards):
+    graph = graphs._Graph(lambda x: x + 1, [torch.zeros(2)], {}, torch.device("cuda", 1))
+    graph.replay([torch.ones(2)], {})
+    assert two_cards.stream.waited == []
+    two_cards.stream = other = Stream("cuda:1", "other")
+    for _ in range(2):
+        graph.replay([torch.ones(2)], {})
+    assert other.waited == ["main"]
 
 
 def test_graphs_are_dropped_with_the_weights_that_they_read():
