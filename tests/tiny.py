@@ -11,7 +11,7 @@ from diffusers.configuration_utils import ConfigMixin, register_to_config
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.pose.refine import CheckedViews, measure_fit, refine_views
+from geodiff_plugin.pose.refine import CheckedViews, measure_fit, posed_greys, refine_views
 from geodiff_plugin.types import PosedViews
 
 SCHEDULER = {
@@ -181,4 +181,4 @@ def make_oracle(relative: np.ndarray, prediction_type: str = "depth") -> Marigol
 
 def checked_views(posed: PosedViews, measured: bool = False) -> CheckedViews:
     """What ``refine_views`` makes of views whose fit is measured first."""
-    return refine_views(posed, measure_fit(posed), measured)
+    return refine_views(posed, measure_fit(posed_greys(posed)), measured)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,7 +24,14 @@ from geodiff_plugin.matching.matches import read_above
 from geodiff_plugin.matching.rows import RowMatches, RowPictures, match_rows, rectified_pictures
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.pose.refine import PoseFit, measure_fit, refine_views, report_as_given
+from geodiff_plugin.pose.refine import (
+    PoseFit,
+    measure_fit,
+    posed_greys,
+    refine_views,
+    report_as_given,
+    surely_fits,
+)
 from geodiff_plugin.scale.points import RELIABLE, reliable_matches
 from geodiff_plugin.types import PosedViews
 
@@ -57,34 +65,58 @@ def make_evidence(
         posed = _with_clean_images(posed, config)
         report = Beside.known(report_as_given(posed.views))
         return replace(prepare_evidence(posed, points, config), report=report)
-    clear, measured = _measured_beside(posed, config)
-    evidence = None
     if leaves_cpu_free(left_01.device):
-        # Matching features keeps the CPU busy; meanwhile the device matches the views as given, as most fit.
-        with suppress(InputError):  # raised again below, unless a refined pose mends it
-            evidence = prepare_evidence(clear, points, config)
-    fit, views = measured.result(), clear.views
-    if fit.fits:  # what else there is to find changes no view, and act 3 is the first to ask
-        report = Beside(lambda: refine_views(clear, fit).report, left_01.device)
+        return _made_beside_check(posed, points, config, measured_baseline)
+    posed = _with_clean_images(posed, config)
+    views, found = refine_views(posed, measure_fit(posed_greys(posed)), measured_baseline)
+    made = prepare_evidence(posed._replace(views=views), points, config)
+    return replace(made, report=Beside.known(found))
+
+
+def _made_beside_check(
+    posed: PosedViews, points: Tensor | None, config: GuidanceConfig, measured_baseline: bool
+) -> Evidence:
+    """The same, where the device matches the views while the CPU matches their features.
+
+    As most poses fit, the views are matched as given. Small pictures mostly show that they fit; what else
+    there is to find then changes no view, and act 3 is the first to ask.
+    """
+    (clear, check), evidence = _checked_beside(posed, config), None
+    with suppress(InputError):  # raised again below, unless a refined pose mends it
+        evidence = prepare_evidence(clear, points, config)
+    views = clear.views
+    if check.surely.result() or check.fit.result().fits:
+        report = Beside(lambda: refine_views(clear, check.fit.result()).report, clear.left_01.device)
     else:
-        views, found = refine_views(clear, fit, measured_baseline)
+        views, found = refine_views(clear, check.fit.result(), measured_baseline)
         report = Beside.known(found)
     if evidence is None or any(one is not other for one, other in zip(views, clear.views, strict=True)):
         evidence = prepare_evidence(clear._replace(views=views), points, config)
     return replace(evidence, report=report)
 
 
-def _measured_beside(posed: PosedViews, config: GuidanceConfig) -> tuple[PosedViews, Beside[PoseFit]]:
-    """The views with clean photographs, and how their poses fit.
+class _Check(NamedTuple):
+    """Whether poses fit, as the CPU works it out."""
 
-    Features are matched at once where the CPU has nothing else to do, and again if there were flaws.
-    """
+    surely: Beside[bool]  # ``surely_fits``, there first
+    fit: Beside[PoseFit]
+
+
+def _check_beside(posed: PosedViews) -> _Check:
     device = posed.left_01.device
-    early = Beside(lambda: measure_fit(posed), device) if leaves_cpu_free(device) else None
+    greys = Beside(lambda: posed_greys(posed), device)
+    surely = Beside(lambda: surely_fits(greys.result()), device)
+    return _Check(surely, Beside(lambda: measure_fit(greys.result(), surely.result), device))
+
+
+def _checked_beside(posed: PosedViews, config: GuidanceConfig) -> tuple[PosedViews, _Check]:
+    """The views with clean photographs, and whether their poses fit.
+
+    Features are matched before it is known whether there are flaws, and again if there were.
+    """
+    early = _check_beside(posed)
     clear = _with_clean_images(posed, config)
-    if early is not None and clear is posed:
-        return clear, early
-    return clear, Beside(lambda: measure_fit(clear), device)
+    return (clear, early) if clear is posed else (clear, _check_beside(clear))
 
 
 def prepare_evidence(native: PosedViews, points: Tensor | None, config: GuidanceConfig) -> Evidence:

@@ -369,17 +369,40 @@ def _feature_threads(process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="geodiff-features")
 
 
-def sparse_tracks(views: Sequence[GreyImage]) -> Tracks:
-    """SIFT points of the left image with their matches in the right ones."""
+def sparse_tracks(views: Sequence[GreyImage], scale: float = 1.0) -> Tracks:
+    """SIFT points of the left image with their matches in the right ones, in pixels of these images.
+
+    They are sought in images of ``scale`` times the size.
+    """
     (_, K), *rights = views
-    left, *of_rights = _feature_threads(os.getpid()).map(sift_features, [grey for grey, _ in views])
+    greys = [_shrunk(grey, scale) for grey, _ in views]
+    found = _feature_threads(os.getpid()).map(sift_features, greys)
+    left, *of_rights = (
+        (_enlarged(points[:, :2], small, grey), descriptors)
+        for (points, descriptors), small, (grey, _) in zip(found, greys, views, strict=True)
+    )
     right_px = np.zeros((len(rights), len(left[0]), 2))
     seen = np.zeros(right_px.shape[:2], bool)
     for v, right in enumerate(of_rights):
         of_left, of_right = match_features(left, right).T
-        right_px[v, of_left], seen[v, of_left] = right[0][of_right, :2], True
+        right_px[v, of_left], seen[v, of_left] = right[0][of_right], True
     K_rights = np.stack([K_right for _, K_right in rights])
-    return Tracks(left[0][:, :2], right_px, seen, K, K_rights).seen_anywhere()
+    return Tracks(left[0], right_px, seen, K, K_rights).seen_anywhere()
+
+
+def _shrunk(grey: np.ndarray, scale: float) -> np.ndarray:
+    """An image ``(H, W)`` of ``scale`` times the size."""
+    if scale == 1.0:
+        return grey
+    height, width = (max(1, round(side * scale)) for side in grey.shape)
+    return cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _enlarged(px: np.ndarray, small: np.ndarray, large: np.ndarray) -> np.ndarray:
+    """Pixels ``(N, 2)`` of a small image in the large one that it was made of."""
+    if small.shape == large.shape:
+        return px
+    return (px + 0.5) * (np.array(large.shape[::-1]) / small.shape[::-1]) - 0.5
 
 
 def _flow(source: np.ndarray, target: np.ndarray) -> np.ndarray:

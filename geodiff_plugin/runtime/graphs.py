@@ -48,8 +48,8 @@ class _Graph:
         with torch.cuda.device(device):
             self._graph = torch.cuda.CUDAGraph()
             # Another thread, which prepares the next pair, may use the device meanwhile.
-            how = {"stream": _recording_stream(device), "capture_error_mode": "thread_local"}
-            with torch.cuda.graph(self._graph, **how):
+            stream = _recording_stream(device)
+            with torch.cuda.graph(self._graph, stream=stream, capture_error_mode="thread_local"):
                 self._output = forward(*args, **kwargs)
 
     def replay(self, args: list[Any], kwargs: dict[str, Any]) -> Any:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin._threads import Beside
+from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.matching.planes import Parallax
 from geodiff_plugin.pose import refine
@@ -565,6 +566,71 @@ def test_evidence_of_poses_that_fit_is_there_before_all_is_known_about_them(pair
     assert made.matches is not None and not asked.is_set()
     asked.set()
     assert made.report.result().status == "fits"
+
+
+def demo_views(turn_deg: float = 0.0) -> PosedViews:
+    """The demo pair, whose right camera has turned up or down."""
+    shown = read_demo_pair()
+    left, right = (torch.from_numpy(each).permute(2, 0, 1) for each in (shown.left, shown.right))
+    T = np.linalg.inv(shown.rig.E @ pose((turn_deg, 0.0, 0.0), (0, 0, 0)))
+    K_left, K_right, T_right = (torch.from_numpy(m).float() for m in (shown.rig.K_left, shown.rig.K_right, T))
+    return PosedViews(left, (CameraView(right, K_right, T_right),), K_left)
+
+
+def test_small_pictures_that_show_that_poses_fit_are_enough(monkeypatch) -> None:
+    """As on CUDA: denoising does not wait for the features of the pictures themselves."""
+    asked = threading.Event()
+
+    def patient(*args):
+        assert asked.wait(60)
+        return refine.measure_fit(*args)
+
+    monkeypatch.setattr("geodiff_plugin.evidence.prepare.measure_fit", patient)
+    for module in ("_threads", "evidence.prepare"):
+        monkeypatch.setattr(f"geodiff_plugin.{module}.leaves_cpu_free", lambda device: True)
+    shown = read_demo_pair()
+    guidance = GeometryGuidance(shown.right, (shown.rig.K_left, shown.rig.K_right), shown.rig.E)
+    (made,) = guidance.prepare(torch.from_numpy(shown.left).permute(2, 0, 1)[None])
+    assert made.matches is not None and not asked.is_set()
+    asked.set()
+    assert made.report.result().status == "fits"
+
+
+@pytest.mark.parametrize(("turn_deg", "fits"), [(0.0, True), (0.1, False), (2.0, False)])
+def test_small_pictures_say_surely_only_of_poses_that_fit(turn_deg: float, fits: bool) -> None:
+    greys = refine.posed_greys(demo_views(turn_deg))
+    assert refine.surely_fits(greys) is fits
+    few = greys._replace(views=[(np.full_like(grey, 90), K) for grey, K in greys.views])
+    assert not refine.surely_fits(few)
+
+
+def test_one_answer_holds_where_small_and_whole_pictures_differ(monkeypatch) -> None:
+    """On CUDA what comes first decides; elsewhere the same has to come out."""
+    monkeypatch.setattr(refine, "FITS_PX", 1e-3)
+    posed = demo_views()
+    greys = refine.posed_greys(posed)
+    asked = []
+    for surely in (False, True):
+        fit = refine.measure_fit(greys, lambda answer=surely: asked.append(answer) or answer)
+        assert fit.fits is surely and (fit.residual_px > fit.limit_px).all()
+    assert asked == [False, True]
+    views, report = refine.refine_views(posed, fit)
+    assert views is posed.views and report.status == "fits"
+    monkeypatch.setattr(refine, "surely_fits", lambda _: True)
+    assert refine.measure_fit(greys).fits
+
+
+def test_matches_of_small_pictures_are_in_pixels_of_the_whole_ones() -> None:
+    rng = np.random.default_rng(0)
+    whole = cv2.GaussianBlur(rng.integers(0, 256, (241, 330)).astype(np.uint8), (0, 0), 3.0)
+    whole = cv2.normalize(whole, None, 0, 255, cv2.NORM_MINMAX)
+    views = [(whole[3:, 10:].copy(), np.eye(3)), (whole[:-3, :-10].copy(), np.eye(3))]
+    tracks = sparse_tracks(views, 0.5)
+    assert len(tracks) > 40
+    moved = np.median(tracks.right_px[0] - tracks.left_px, axis=0)
+    assert moved == pytest.approx((10.0, 3.0), abs=0.1)
+    at = np.median(tracks.left_px / np.array([320, 238]), axis=0)
+    assert at == pytest.approx((0.5, 0.5), abs=0.15)  # all over the whole picture
 
 
 @pytest.mark.parametrize("seed", [pytest.param(2, marks=pytest.mark.slow), 6])
