@@ -659,8 +659,8 @@ def test_a_calibrated_rig_keeps_its_calibration_where_all_matches_fit_it(monkeyp
     given = PosedViews(rig.left.image_01.float(), views, rig.K_left.float())
     sparse_tracks = refine.sparse_tracks
 
-    def missing(images):
-        sparse = sparse_tracks(images)
+    def missing(*images):
+        sparse = sparse_tracks(*images)
         return replace(sparse, right_px=sparse.right_px + np.array([0.0, 0.6]))
 
     monkeypatch.setattr(refine, "sparse_tracks", missing)
