@@ -658,6 +658,22 @@ MUTANTS = [
         tests=(f"{UNIT}finished.py",),
     ),
     *of(
+        "jobs/many.py",
+        ("available_cores() // processes - CORES_OF_STAGES", "available_cores() - CORES_OF_STAGES"),
+        tests=(f"{UNIT}runner.py",),
+    ),
+    *of(
+        "jobs/journal.py",
+        ("max(1, min(self.count, gpus))", "max(1, self.count)"),
+        ('"LOCAL_WORLD_SIZE", max(', '"WORLD_SIZE", max('),
+        tests=(f"{UNIT}runner.py",),
+    ),
+    *of(
+        "formats/layouts.py",
+        ("for count in others if count)", "for count in others)"),
+        tests=(f"{UNIT}capture_files.py",),
+    ),
+    *of(
         "jobs/capture.py",
         (
             'read_report(folder).get("made_from") == item.inputs',

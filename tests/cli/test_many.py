@@ -191,25 +191,6 @@ def test_ctrl_c_while_several_processes_write_leaves_whole_folders(geodiff, fres
     assert answer.code == 0 and "0 failed" in answer.out and f"{len(folders)} there" in answer.out
 
 
-@pytest.mark.parametrize(
-    ("device", "cores", "pairs", "processes", "count"),
-    [
-        ("cuda", 16, 100, 1, 3),
-        ("cuda", 5, 100, 1, 2),
-        ("cuda", 1, 100, 1, 1),
-        ("cuda", 16, 2, 1, 2),
-        ("cuda", 40, 100, 8, 2),  # eight GPUs of one machine, 5 cores each
-        ("cuda", 16, 100, 8, 1),
-        ("cpu", 16, 9, 1, 0),
-    ],
-)
-def test_no_more_processes_write_than_cores_and_pairs_allow(
-    monkeypatch, device, cores, pairs, processes, count
-):
-    monkeypatch.setattr(many, "available_cores", lambda: cores)
-    assert many.count_writers(torch.device(device), pairs, processes) == count
-
-
 @pytest.mark.parametrize(("writers", "started"), [(3, [3]), (0, [])])
 def test_the_stages_start_as_many_writers_as_they_are_told(monkeypatch, writers, started):
     counts = []
