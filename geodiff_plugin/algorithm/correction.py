@@ -267,10 +267,10 @@ def prior_error(
     side = max(1, round(BLOCK * max(height, width)))
     rows, columns = (torch.arange(n, device=depth_m.device) // side for n in (height, width))
     black = ((rows[:, None] + columns[None]) % 2).to(observed.residual.dtype)
-    of_black = observed.weight * black
+    weight_of_black = observed.weight * black
     first = _spread(observed.residual, observed)
-    kept = torch.cat([of_black, observed.weight - of_black])
-    of_black, of_white = _stiff(observed, kept, first, config).field.chunk(2)
+    trusted = torch.cat([weight_of_black, observed.weight - weight_of_black])
+    of_black, of_white = _stiff(observed, trusted, first, config).field.chunk(2)
     error = _spread(torch.where(black > 0, of_white, of_black) - observed.residual, observed)
     share = ((observed.weight > 0).float().sum((1, 2, 3), keepdim=True) / FEW_POINTS).clamp_max(1.0)
     return error**share * MOST_ERROR ** (1.0 - share)

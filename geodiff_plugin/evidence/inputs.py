@@ -27,6 +27,9 @@ from geodiff_plugin.formats.images import warn_of_other_lens
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.types import CameraView, PosedViews, Rig
 
+#: What known depths are, for messages.
+POINTS = "a sparse depth map (H, W) or points (N, 3) in the left camera's frame, metres"
+
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
@@ -192,20 +195,7 @@ def as_points(value: Any, name: str, confidence: Any = None) -> Tensor:
 
     A ``confidence`` in [0, 1], ``(N,)`` or ``(H, W)``, becomes the last channel; 0 marks unknown depth.
     """
-    forms = "a sparse depth map (H, W) or points (N, 3) in the left camera's frame, metres"
-    if isinstance(value, Tensor):
-        value = value.detach().cpu()
-        value = (value.float() if value.dtype == torch.bfloat16 else value).numpy()  # numpy has no bfloat16
-    try:
-        array = np.asarray(value)
-    except (ValueError, TypeError):
-        bad_type(name, forms, value)
-    if array.dtype.kind not in "fiu":
-        bad_type(name, forms, value)
-    if array.ndim != 2 or array.shape[1] < 3:
-        bad_value(name, forms, f"shape {array.shape}")
-    if array.shape[1] in (4, 6):  # with an intensity, or a colour; no image is that narrow
-        array = array[:, :3]
+    array = _point_numbers(value, name)
     if array.shape[1] != 3 or not isinstance(value, (list, tuple)):  # a typed list is in metres
         check_metres(array, name)
     array, is_cloud = array.astype(np.float32), array.shape[1] == 3
@@ -215,13 +205,30 @@ def as_points(value: Any, name: str, confidence: Any = None) -> Tensor:
         parts.append(_as_confidence(confidence, array, f"{name}_confidence"))
         known &= parts[1] > 0
     if not known.any():
-        bad_value(name, forms + ", at least one of them known", "none: all are 0, NaN or infinite")
+        bad_value(name, f"{POINTS}, at least one of them known", "none: all are 0, NaN or infinite")
     if is_cloud:
         array = np.column_stack(parts)[known]
     else:
         array = np.stack([np.where(known, part, np.float32(0)) for part in parts], axis=-1)
         array = array if confidence is not None else array[..., 0]
     return torch.from_numpy(np.ascontiguousarray(array))
+
+
+def _point_numbers(value: Any, name: str) -> np.ndarray:
+    """Points ``(N, 3)`` or a map ``(H, W)`` as an array of numbers of the given type."""
+    if isinstance(value, Tensor):
+        value = value.detach().cpu()
+        value = (value.float() if value.dtype == torch.bfloat16 else value).numpy()  # numpy has no bfloat16
+    try:
+        array = np.asarray(value)
+    except (ValueError, TypeError):
+        bad_type(name, POINTS, value)
+    if array.dtype.kind not in "fiu":
+        bad_type(name, POINTS, value)
+    if array.ndim != 2 or array.shape[1] < 3:
+        bad_value(name, POINTS, f"shape {array.shape}")
+    # With an intensity, or a colour; no image is that narrow.
+    return array[:, :3] if array.shape[1] in (4, 6) else array
 
 
 def _as_confidence(value: Any, points: np.ndarray, name: str) -> np.ndarray:

@@ -87,14 +87,8 @@ def read_pair(
     Raises:
         InputError: a file that cannot be read, or cameras that do not fit the images.
     """
-    views, config = options.photographs(), options.config()
-    as_stored = bool(options.calib) and is_as_stored(options.calib)
-    if frames is not None:
-        images = list(frames)
-    else:
-        first = _read_both(options, as_stored) if options.both_in_one else []
-        others = list(views.items())[len(first) :]
-        images = [*first, *(_read_view(path, name, as_stored) for name, path in others)]
+    config = options.config()
+    images = _read_images(options) if frames is None else list(frames)
     sizes = [(image.shape[1], image.shape[0]) for image in images]
     with noted() as warned:  # of the calibration; what forbids trust in it forbids trust in the result
         if options.estimate_pose:
@@ -103,8 +97,8 @@ def read_pair(
             cameras = _cameras_with_poses(options, images, names, of_files=frames is None)
     lenses = lenses_of(options, cameras.rig)
     images = [pinhole(*each, config) for each in zip(images, cameras.Ks, lenses, strict=False)]
-    known: dict[str, Any] = {"cropped": options.cropped}
-    known["points"] = _read_known(options, cameras.Ks[0], lenses[0], sizes[0], cameras.rig)
+    points = _read_known(options, cameras.Ks[0], lenses[0], sizes[0], cameras.rig)
+    known: dict[str, Any] = {"cropped": options.cropped, "points": points}
     if options.points_confidence is not None:
         known["points_confidence"] = read_confidence(options.points_confidence, "--points-confidence")
     if cameras.rig is None:
@@ -121,6 +115,14 @@ def read_pair(
         check_colmap_names(unique_names(options.photographs().values()))
     prior_map = None if options.prior_map is None else read_map(options.prior_map, "--prior-map")
     return PairInputs(images[0], rig, guidance, undistorted_any, prior_map, cameras.notes)
+
+
+def _read_images(options: DepthOptions) -> list[np.ndarray]:
+    """The views as they lie in their files, left one first, ``(H, W, 3)`` float32 in [0, 1]."""
+    as_stored = bool(options.calib) and is_as_stored(options.calib)
+    first = _read_both(options, as_stored) if options.both_in_one else []
+    others = list(options.photographs().items())[len(first) :]
+    return [*first, *(_read_view(path, name, as_stored) for name, path in others)]
 
 
 def _cameras_without_poses(options: DepthOptions, sizes: Sequence[Size]) -> _Cameras:

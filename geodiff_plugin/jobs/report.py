@@ -174,11 +174,8 @@ def summary_line(report: dict[str, Any], where: str) -> str:
     if verdict["status"] != "trusted":
         reason = verdict["reasons"][0] if verdict["reasons"] else f"{UNTESTED}."
         return f"{verdict['status'].upper()}: {reason} (Unconfirmed: {metres}; {end})"
-    found, error, prior_scale = (
-        verdict["indicators"],
-        report.get("expected_error_median_m"),
-        report["prior_scale"],
-    )
+    found, prior_scale = verdict["indicators"], report["prior_scale"]
+    error = report.get("expected_error_median_m")
     trusted = [standing_words(verdict["status"], bool(report.get("assumed")))]
     trusted += [] if found["confidence"] is None else [f"confidence {found['confidence']:.2f}"]
     trusted += [] if error is None else [f"expected error {_length(error, report['unit'])}"]

@@ -32,6 +32,8 @@ BRIGHTNESS = 0.1
 WINDOW = [(v, u) for v in range(-HALF, HALF + 1) for u in range(-HALF, HALF + 1) if (v + u) % 2 == 0]
 #: Pixels between samples of the window: it has to reach beyond the ragged border of a sweep's match.
 SPACING = 4
+#: Pixels that the window reaches to each side.
+HALO = HALF * SPACING
 #: Weight of a row match, and of a hidden strip, relative to a sure match of the sweep: they place edges on a
 #: finer grid.
 ROWS = 1.5
@@ -265,34 +267,38 @@ def _vote_in_windows(voters: Sequence[_Votes], left: Tensor, shift: Tensor, map_
     ``map_vote`` is the weight of the map's ``shift (H, W)`` as a share of a window full of sure matches;
     neighbours of another colour in ``left (3, H, W)`` count for less.
     """
-    height, width = shift.shape
-    halo = HALF * SPACING
-    layers = torch.stack([values for pair in voters for values in pair])
-    padded = F.pad(torch.cat([layers, left])[None], (halo,) * 4, mode="replicate")[0]
+    height, count = len(shift), len(voters)
+    layers = torch.stack([*(each.shift for each in voters), *(each.weight for each in voters)])
+    padded = F.pad(torch.cat([layers, left])[None], (HALO,) * 4, mode="replicate")[0]
     closeness = [math.exp(-(v**2 + u**2) / (2.0 * REACH**2)) for v, u in WINDOW]
     weight_of_map = map_vote * sum(closeness)
     of_window = to_device_of(shift, torch.tensor(closeness, dtype=shift.dtype, device="cpu"))[:, None, None]
-    down, right = to_device_of(shift, torch.tensor(WINDOW, device="cpu").T + HALF)
+    places = to_device_of(shift, torch.tensor(WINDOW, device="cpu").T + HALF)
     out = torch.empty_like(shift)
-    count = _rows_at_once(shift)
-    for first in range(0, height, count):
-        rows = slice(first, min(height, first + count))
-        part = padded[:, rows.start : rows.stop + 2 * halo]
-        side, (of_layer, of_row, _) = 2 * HALF + 1, part.stride()
-        shape = len(part), side, side, rows.stop - rows.start, width
-        strides = of_layer, SPACING * of_row, SPACING, of_row, 1
-        around = part.as_strided(shape, strides, part.storage_offset())[:, down, right]
-        votes, weights, colours = (
-            around[0 : len(layers) : 2],
-            around[1 : len(layers) : 2],
-            around[len(layers) :],
-        )
+    rows_at_once = _rows_at_once(shift)
+    for first in range(0, height, rows_at_once):
+        rows = slice(first, min(height, first + rows_at_once))
+        around = _windows(padded[:, rows.start : rows.stop + 2 * HALO], places)
+        votes, weights, colours = around[:count], around[count : 2 * count], around[2 * count :]
         alike = (colours - left[:, None, rows]).abs_().mean(0).div_(-BRIGHTNESS).exp_() * of_window
         own = shift[rows][None]
         votes = torch.cat([own, votes.flatten(0, 1)])
         weights = torch.cat([weight_of_map.expand_as(own), (weights * alike).flatten(0, 1)])
         out[rows] = _mean_near_median(votes, weights)
     return out
+
+
+def _windows(padded: Tensor, places: Tensor) -> Tensor:
+    """``(C, n, h, w)`` the ``n`` values around every pixel, of layers ``(C, h + 2 HALO, w + 2 HALO)``.
+
+    ``places (2, n)`` are rows and columns of the whole window of ``2 HALF + 1`` samples, from 0.
+    """
+    of_layer, of_row, _ = padded.stride()
+    side, height, width = 2 * HALF + 1, padded.shape[1] - 2 * HALO, padded.shape[2] - 2 * HALO
+    shape = len(padded), side, side, height, width
+    strides = of_layer, SPACING * of_row, SPACING, of_row, 1
+    down, right = places
+    return padded.as_strided(shape, strides, padded.storage_offset())[:, down, right]
 
 
 def _mean_near_median(votes: Tensor, weights: Tensor) -> Tensor:

@@ -114,10 +114,13 @@ class Layers:
         return devices.pop() if len(devices) == 1 else None
 
 
-def images_in_float32(processor: Any, known: tuple[Any, Any] = (None, None)) -> AbstractContextManager[None]:
+def images_in_float32(
+    processor: Any, seen: Any = None, preprocessed: Any = None
+) -> AbstractContextManager[None]:
     """Let an image processor work in float32: float16 cannot hold the white of a 16-bit image, 65535.
 
-    ``known`` are an image and what ``preprocess`` returned for it with the arguments of the call, if it ran.
+    ``preprocessed`` is what ``preprocess`` returned for the image ``seen`` with the arguments of the call, if
+    it ran already.
     """
     stock = processor.preprocess
 
@@ -129,8 +132,8 @@ def images_in_float32(processor: Any, known: tuple[Any, Any] = (None, None)) -> 
         dtype: torch.dtype = torch.float32,
     ) -> Any:
         arguments = image, processing_resolution, resample_method_input, device, torch.float32
-        already = known[1] if image is known[0] else None
-        images, *rest = stock(*arguments) if already is None else already
+        is_done = preprocessed is not None and image is seen
+        images, *rest = preprocessed if is_done else stock(*arguments)
         return images.to(dtype), *rest
 
     return replaced(processor, "preprocess", preprocess)

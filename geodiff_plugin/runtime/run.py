@@ -78,10 +78,10 @@ class GuidedRun:
 
     def __enter__(self) -> GuidedRun:
         with ExitStack() as stack:
-            preprocessed = self.call["image"], self._codec.grid.preprocessed
             if self._plan.inner_steps:  # else nothing is differentiated
                 stack.enter_context(hooks.frozen_weights(self.pipe))
-            stack.enter_context(hooks.images_in_float32(self.pipe.image_processor, preprocessed))
+            image, preprocessed = self.call["image"], self._codec.grid.preprocessed
+            stack.enter_context(hooks.images_in_float32(self.pipe.image_processor, image, preprocessed))
             if self.pipe._faster is not None:
                 stack.enter_context(self.pipe._faster.attached(self.pipe))
             if self._tap is not None:

@@ -200,9 +200,9 @@ def _coarse_to_fine(
     reach = log_span / (COARSE_GRID - 1)
     for values in FINE_GRIDS:
         offsets = torch.linspace(-1, 1, values, dtype=like.dtype, device=like.device)
-        n = best.near_m.log() + reach * offsets.repeat_interleave(values)
-        f = best.far_m.log() + reach * offsets.repeat(values)
-        n, f = n.exp().clamp(low, high), f.exp().clamp(low, high)
-        best = best_of(torch.minimum(n, f), torch.maximum(n, f))
+        log_near = best.near_m.log() + reach * offsets.repeat_interleave(values)
+        log_far = best.far_m.log() + reach * offsets.repeat(values)
+        near, far = (each.exp().clamp(low, high) for each in (log_near, log_far))
+        best = best_of(torch.minimum(near, far), torch.maximum(near, far))
         reach = reach / (values - 1) * 2
     return best
