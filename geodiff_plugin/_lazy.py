@@ -28,20 +28,26 @@ def importer(package: str, module_of: Mapping[str, str]) -> Callable[[str], Any]
     return get
 
 
+#: Whether ``uncollected`` has done so. (``gc.get_freeze_count`` would count the objects one by one.)
+_left_out = False
+
+
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """Around the imports of a program: the garbage collector leaves out what they make.
+    """Around the imports of a program: the garbage collector leaves out what the first ones make.
 
     They make half a million objects of torch and its relatives, which stay to the end of the process. The
     collector would look through them again and again, which takes a fifth of the time of the imports. This is
     only for processes of our own, such as a command's: what is garbage before the imports stays as well.
     """
-    if gc.get_freeze_count() or not gc.isenabled():
+    global _left_out
+    if _left_out or not gc.isenabled():
         yield
         return
     gc.disable()
     try:
         yield
         gc.freeze()
+        _left_out = True
     finally:
         gc.enable()

@@ -24,6 +24,32 @@ def _why_not(device: str) -> str | None:
     return None if torch.cuda.is_available() else "no CUDA device"
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _language_interpreted_once():
+    """The interpreter's functions stand in for the language's until the end.
+
+    It puts them there anew at every launch, and at every call of a function of a kernel, which takes it two
+    fifths of its time.
+    """
+    if not (has_triton() and interpreting()):
+        yield
+        return
+    from triton.runtime import interpreter
+
+    stand_in, done = interpreter._patch_lang, set()
+
+    def stand_in_once(function):
+        module = id(function.__globals__)
+        if module not in done:
+            stand_in(function)
+            done.add(module)
+        return interpreter._LangPatchScope()  # nothing to be taken back
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(interpreter, "_patch_lang", stand_in_once)
+        yield
+
+
 @pytest.fixture(scope="session", params=[_INTERPRETER, _CARD])
 def device(request) -> torch.device:
     """The device of the tensors on which a kernel and its reference are compared."""
