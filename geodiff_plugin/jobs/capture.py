@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import multiprocessing
+import pickle
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -20,6 +21,7 @@ import torch
 
 from geodiff_plugin import __version__
 from geodiff_plugin._checks import InputError, bad_value, refuse, warn
+from geodiff_plugin._lazy import call_uncollected
 from geodiff_plugin._threads import WithinCores, available_cores
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.capture.results import ALONE, save_alone, write_agreement, write_results
@@ -257,8 +259,8 @@ def _in_processes(
     """The frames by so many processes, a shard each, of which this is one; whether none was lost."""
     context, more = multiprocessing.get_context("spawn"), list[Any]()
     for index in range(1, count):
-        arguments = options, items, keys, Shard(index, count)
-        more.append(context.Process(target=_help, args=arguments, daemon=True))
+        helping = pickle.dumps((_help, (options, items, keys, Shard(index, count))))
+        more.append(context.Process(target=call_uncollected, args=(helping,), daemon=True))
         more[-1].start()
     try:
         _work(capture, options, items, Shard(0, count), progress)
