@@ -874,6 +874,12 @@ MUTANTS = [
         ),
     ),
     *of(
+        "result/flattening.py",
+        ("clamp_min(LEAST_INVERSE) ** 2", "clamp_min(LEAST_INVERSE) ** 0"),
+        ("left_01, DENOISED_EDGE)", "left_01, 1e3 * DENOISED_EDGE)"),
+        tests=(f"{UNIT}flattening.py",),
+    ),
+    *of(
         "result/flattening_kernels.py",
         ("inverse, smoothed, *links, pull", "inverse, smoothed, *links[::-1], pull"),
         tests=(f"{KERNELS}flattening.py",),

@@ -226,7 +226,7 @@ def refine(
         completed = _with_hidden(target, evidence)
         known = known_share(completed)
         fitted_m = vote_depth(fitted_m, evidence, completed, known, measured, spacing)
-        fitted_m = flatten(fitted_m, completed, left_01, measured)
+        fitted_m = flatten(fitted_m, completed, left_01, measured, denoised_m)
         support = fit.support * determined(known, image_size(fit.support))
     return Refined(fitted_m, support, grounds_of(denoised_m, fitted_m, target, fit.support))
 

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._kernels import use_kernel
-from geodiff_plugin.algorithm.correction import DEPTH_EDGE, edge_links
+from geodiff_plugin.algorithm.correction import DEPTH_EDGE, edge_links, log_depth_at
 from geodiff_plugin.algorithm.solver import FieldSystem, solve_field
 from geodiff_plugin.geometry import constant_like, image_size
 from geodiff_plugin.matching import Matches, known_shape
@@ -31,12 +31,15 @@ SLOPE_SMOOTHNESS = 300.0
 #: Weight of the smoothed slopes against that of the values.
 SLOPES = 40.0
 #: Weight of a value where nothing is known, for a prior of ``WEAK_PRIOR`` or worse: it holds wide shapes.
-LEAST_VALUE_WEIGHT = 0.02
+LEAST_VALUE_WEIGHT = 0.015
 #: The same on the grid of the votes, where only detail of a few pixels is to go.
 LEAST_DETAIL_WEIGHT = 0.5
 #: Step in log depth across which detail is not smoothed: less than ``DEPTH_EDGE``, so that edges stay sharp.
 #: The map of a good prior has the same, as its small steps are no errors.
 DETAIL_EDGE = 0.03
+#: Step in log depth of the denoised map that is an edge. It is small: the false steps of a fitted map are the
+#: borders of patches of wrong matches, which the denoised map does not follow.
+DENOISED_EDGE = 0.02
 #: Error of a prior from which these weights are the least. They grow as the fourth power of a smaller error,
 #: as the stiffness of the fit does: the surfaces of a good prior need no smoothing.
 WEAK_PRIOR = 0.1
@@ -46,26 +49,32 @@ MOST_VALUE_WEIGHT = 1e3
 STEPS = 8
 #: The inverse depth is never lowered below this share of itself.
 LEAST_SHARE = 0.3
+#: Least inverse depth of which a change counts as a share, about 1 in the mean: depth is nearly unbounded.
+LEAST_INVERSE = 1e-3
 
 
 class _Surface(NamedTuple):
     """A map on one grid, ``(1, 1, h, w)``."""
 
-    log_depth: Tensor
     inverse: Tensor  # about 1, so that no weight depends on the unit
     links: tuple[Tensor, Tensor]  # ``edge_links``, across and down
 
 
 @torch.no_grad()
-def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor) -> Tensor:
+def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor, denoised_m: Tensor) -> Tensor:
     """Make the slopes of inverse depth alike where the matches know little, and leave the rest as it is.
 
-    With ``q`` the inverse depth, ``k`` the ``known_shape`` of the matches, and ``g`` links that fall at edges
-    of image and depth, the slopes ``s`` of ``q`` along either axis are smoothed to ``t = argmin sum g (k^2 +
-    LEAST_SLOPE_WEIGHT) (t - s)^2 + SLOPE_SMOOTHNESS sum g |grad t|^2``. The result is ``q + e`` with ``e =
-    argmin sum w e^2 + SLOPES sum g |grad (q + e) - t|^2`` and ``w = k^2 / (1 - k) + w_0``, where ``w_0`` is
-    ``LEAST_VALUE_WEIGHT`` of a weak prior, and more of a better one. A step of ``DEPTH_EDGE`` in log depth is
-    an edge of a weak prior's map, and a smaller one, down to ``DETAIL_EDGE``, of a better one's.
+    With ``q`` the inverse depth, about 1 in the mean, ``k`` the ``known_shape`` of the matches, and ``g``
+    links that fall at edges of image and depth, the slopes ``s`` of ``q`` along either axis are smoothed to
+    ``t = argmin sum g (k^2 + LEAST_SLOPE_WEIGHT) (t - s)^2 + SLOPE_SMOOTHNESS sum g |grad t|^2``. The result
+    is ``q + e`` with ``e = argmin sum w (e / q)^2 + SLOPES sum g |grad (q + e) - t|^2`` and ``w = k^2 / (1 -
+    k) + w_0``, where ``w_0`` is ``LEAST_VALUE_WEIGHT`` of a weak prior, and more of a better one. A change
+    counts by its share of ``q``, as the error of a prior is one of log depth. Otherwise what lies far behind
+    an edge, whose ``q`` is small, would be drawn to what is near.
+
+    A step of ``DEPTH_EDGE`` in log depth is an edge of a weak prior's map, and a smaller one, down to
+    ``DETAIL_EDGE``, of a better one's. A step of ``DENOISED_EDGE`` in the denoised map is an edge, however
+    weak its prior.
 
     The map has detail finer than the grid of the matches: upsampling, sharpened edges and votes leave specks
     of a pixel or a few. So the second problem is solved once more, for ``q + e`` in place of ``q``, on the
@@ -77,6 +86,7 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor) ->
         target: the matches.
         left_01: ``(1, 3, h, w)`` in [0, 1], the left image at any resolution.
         error: ``(1, 1, 1, 1)`` of the prior in log depth.
+        denoised_m: as ``depth_m``, the map before it was fitted to the matches for the last time.
 
     Returns:
         As ``depth_m``.
@@ -84,15 +94,20 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor) ->
     log_depth = depth_m.float().log()
     unit, good = log_depth.mean(), (WEAK_PRIOR / error).clamp_min(1.0) ** 4
     edge = (DEPTH_EDGE / good.sqrt()).clamp_min(DETAIL_EDGE)
-    surface = _surface(log_depth, target.size, left_01, unit, edge)
-    known = known_shape(target, torch.exp(-surface.log_depth))
+    on_grid = _on(log_depth, target.size)
+    fitted = _links(on_grid, left_01, edge)
+    denoised = _links(log_depth_at(denoised_m, target.size), left_01, DENOISED_EDGE)
+    links = torch.minimum(fitted[0], denoised[0]), torch.minimum(fitted[1], denoised[1])
+    surface = _Surface(torch.exp(unit - on_grid), links)
+    known = known_shape(target, torch.exp(-on_grid))
     slopes, held = _smoothed(surface, known), _held(known)
-    change = _towards(slopes, surface, held + LEAST_VALUE_WEIGHT * good)
+    change = _towards(slopes, surface, _relative(held + LEAST_VALUE_WEIGHT * good, surface))
     lowering = _on(_lowering(surface, change), image_size(depth_m))
     size = grid_of_rows(image_size(depth_m))
-    surface = _surface(log_depth - lowering, size, left_01, unit, DETAIL_EDGE)
+    on_grid = _on(log_depth - lowering, size)
+    surface = _Surface(torch.exp(unit - on_grid), _links(on_grid, left_01, DETAIL_EDGE))
     finer = constant_like(slopes, target.size[1] / size[1], target.size[0] / size[0]).view(2, 1, 1, 1)
-    weight = _on(held, size) + LEAST_DETAIL_WEIGHT * good
+    weight = _relative(_on(held, size) + LEAST_DETAIL_WEIGHT * good, surface)
     change = _towards(finer * _on(slopes, size), surface, weight, torch.zeros_like(weight))
     lowering = lowering + _on(_lowering(surface, change), image_size(depth_m))
     return (depth_m * torch.exp(-lowering)).to(depth_m.dtype)
@@ -105,18 +120,20 @@ def _on(x: Tensor, size: tuple[int, int], *, antialias: bool = False) -> Tensor:
     return F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=antialias)
 
 
-def _surface(
-    log_depth: Tensor, size: tuple[int, int], left_01: Tensor, unit: Tensor, edge: Tensor | float
-) -> _Surface:
-    """A map on a grid, with links that fall to a third across a step of ``edge`` in log depth."""
-    log_depth = _on(log_depth, size)
-    links = edge_links(_on(left_01.float(), size, antialias=True), log_depth * (DEPTH_EDGE / edge))
-    return _Surface(log_depth, torch.exp(unit - log_depth), links)
+def _links(log_depth: Tensor, left_01: Tensor, edge: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Links on the grid of a map, which fall to a third across a step of ``edge`` in log depth."""
+    guide = _on(left_01.float(), image_size(log_depth), antialias=True)
+    return edge_links(guide, log_depth * (DEPTH_EDGE / edge))
 
 
 def _held(known: Tensor) -> Tensor:
     """The weight of values by what is known of them."""
     return (known**2 / (1.0 - known).clamp_min(1e-6)).clamp_max(MOST_VALUE_WEIGHT)
+
+
+def _relative(weight: Tensor, surface: _Surface) -> Tensor:
+    """The weight of changes of the inverse depth by that of their shares of it."""
+    return weight / surface.inverse.clamp_min(LEAST_INVERSE) ** 2
 
 
 def _lowering(surface: _Surface, change: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ def test_values_are_drawn_to_the_same_smoothed_slopes(device, seed, size):
 
     inverse, known = 0.5 + drawn(height, width), drawn(height, width) ** 3
     links = drawn(height, width - 1) + 1e-3, drawn(height - 1, width) + 1e-3
-    surface = flattening._Surface(-inverse.log(), inverse, links)
+    surface = flattening._Surface(inverse, links)
 
     def pulled() -> torch.Tensor:
         return flattening._forces(inverse, flattening._smoothed(surface, known), links)
@@ -50,13 +50,14 @@ def test_a_map_is_flattened_alike_on_both_grids(device, seed):
         return torch.rand(1, channels, *size, generator=generator).to(device)
 
     depth_m, left_01 = 2.0 + 0.1 * drawn(1, 23, 27), drawn(3, 23, 27)
+    denoised_m = depth_m + 0.1 * drawn(1, 23, 27)
     step = torch.tensor([0.01], device=device)
     matches = Matches(0.5 + drawn(1, 12, 14), drawn(1, 12, 14), step, 1.0 + 9.0 * drawn(1, 12, 14))
     error = torch.full((1, 1, 1, 1), 0.15, device=device)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(solver, "COARSEST_STEPS", 6)
         patch.setattr(flattening, "STEPS", 2)
-        found = flattening.flatten(depth_m, matches, left_01, error)
+        found = flattening.flatten(depth_m, matches, left_01, error, denoised_m)
         with without_kernels():
-            expected = flattening.flatten(depth_m, matches, left_01, error)
+            expected = flattening.flatten(depth_m, matches, left_01, error, denoised_m)
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=0.0)

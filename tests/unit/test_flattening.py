@@ -1,5 +1,7 @@
 """Walls whose matches know little: what they know, how far a fit is followed, and flat slopes."""
 
+import math
+
 import pytest
 import torch
 
@@ -11,6 +13,7 @@ from geodiff_plugin.types import CameraView, PosedViews
 
 SIZE = (48, 64)
 WEAK = torch.full((1, 1, 1, 1), 0.2)
+EVEN = torch.ones(1, 1, *SIZE)  # a denoised map without an edge
 
 
 def matches_of(deviation: float | None, confidence: float = 0.9) -> Matches:
@@ -78,9 +81,9 @@ def test_matches_that_know_little_determine_little() -> None:
 def test_blotches_of_a_slanted_wall_go_where_nothing_is_known_and_stay_where_all_is() -> None:
     _, depth_m = slanted(0.04)
     grey = torch.full((1, 3, *SIZE), 0.5)
-    flat = flatten(depth_m, matches_of(50.0), grey, WEAK)
+    flat = flatten(depth_m, matches_of(50.0), grey, WEAK, EVEN)
     assert off_plane(flat) < 0.3 * off_plane(depth_m)
-    kept = flatten(depth_m, matches_of(1.0), grey, WEAK)
+    kept = flatten(depth_m, matches_of(1.0), grey, WEAK, EVEN)
     torch.testing.assert_close(kept, depth_m, rtol=2e-3, atol=0.0)
 
 
@@ -94,7 +97,7 @@ def test_specks_finer_than_the_grid_of_the_matches_go_where_nothing_is_known(
     plane = 0.3 + 0.001 * columns + 0.0005 * rows
     speck = (torch.arange(height * width) % 37 == 0).view(size)
     depth_m = (1.0 / (plane * (1.0 + 0.02 * speck)))[None, None]
-    flat_m = flatten(depth_m, matches_of(deviation), torch.full((1, 3, *size), 0.5), WEAK)
+    flat_m = flatten(depth_m, matches_of(deviation), torch.full((1, 3, *size), 0.5), WEAK, EVEN)
     inverse = 1.0 / flat_m
     around = torch.nn.functional.avg_pool2d(inverse, 5, 1, 2)[0, 0]  # 24 of 25 are no speck
     inside = (slice(8, -8),) * 2
@@ -105,10 +108,12 @@ def test_specks_finer_than_the_grid_of_the_matches_go_where_nothing_is_known(
 def test_a_plane_stays_a_plane_and_a_good_prior_keeps_its_relief() -> None:
     grey = torch.full((1, 3, *SIZE), 0.5)
     _, plane_m = slanted(0.0)
-    torch.testing.assert_close(flatten(plane_m, matches_of(50.0), grey, WEAK), plane_m, rtol=5e-3, atol=0.0)
+    torch.testing.assert_close(
+        flatten(plane_m, matches_of(50.0), grey, WEAK, plane_m), plane_m, rtol=5e-3, atol=0.0
+    )
     _, relief_m = slanted(0.01)
     good = torch.full((1, 1, 1, 1), 0.02)
-    kept = flatten(relief_m, matches_of(50.0), grey, good)
+    kept = flatten(relief_m, matches_of(50.0), grey, good, relief_m)
     torch.testing.assert_close(kept, relief_m, rtol=3e-3, atol=0.0)
 
 
@@ -121,7 +126,34 @@ def test_a_step_at_an_edge_of_the_image_stays() -> None:
     )
     depth_m[..., 256:], image[..., 256:] = 2.0, 0.9
     matches = Matches(0.5 * whole, whole, torch.tensor([0.01]), 50.0 * whole)
-    torch.testing.assert_close(flatten(depth_m, matches, image, WEAK), depth_m, rtol=0.05, atol=0.0)
+    torch.testing.assert_close(flatten(depth_m, matches, image, WEAK, depth_m), depth_m, rtol=0.05, atol=0.0)
+
+
+def test_a_step_that_the_image_does_not_show_stays_where_the_denoised_map_has_it_and_goes_elsewhere() -> None:
+    """A step of a fifth between two fronts of one colour, on which nothing is known."""
+    size = 64, 512  # the width for which the strengths of edges hold
+    depth_m, whole = torch.full((1, 1, *size), 4.0), torch.ones(1, 1, *size)
+    depth_m[..., 256:] *= 0.8
+    matches = Matches(0.25 * whole, whole, torch.tensor([0.002]), 50.0 * whole)
+
+    def left_of_it(denoised_m: torch.Tensor) -> float:
+        flat_m = flatten(depth_m, matches, torch.full((1, 3, *size), 0.5), WEAK, denoised_m)
+        return float((flat_m[..., 246] / flat_m[..., 266]).log().mean()) / math.log(1.0 / 0.8)
+
+    assert 0.9 <= left_of_it(depth_m) <= 1.0
+    assert left_of_it(whole) <= 0.5
+
+
+def test_what_is_far_is_not_drawn_to_what_is_near_across_an_edge() -> None:
+    """A front before a plane ten times as far; the coarser the grid, the less links fall at edges."""
+    size = 192, 256
+    depth_m, image = torch.full((1, 1, *size), 2.0), torch.full((1, 3, *size), 0.4)
+    depth_m[..., 128:], image[..., 128:] = 20.0, 0.8
+    whole = torch.ones_like(depth_m)
+    flat_m = flatten(
+        depth_m, Matches(0.25 * whole, whole, torch.tensor([0.01]), 50.0 * whole), image, WEAK, whole
+    )
+    torch.testing.assert_close(flat_m[..., 128:], depth_m[..., 128:], rtol=0.05, atol=0.0)
 
 
 def test_a_blank_wall_has_wide_matches_and_a_textured_one_narrow_ones() -> None:
