@@ -121,18 +121,18 @@ def test_two_folders_give_what_single_runs_give(geodiff, finished):
 
 @pytest.fixture
 def beside_gpu(monkeypatch):
-    """As on a GPU, two processes write; takes what is called with every pair's place before it is written."""
+    """As on a GPU, processes write; takes what is called with every pair's place before it is written."""
 
-    def let(before):
+    def let(before, writers=2):
         class Watched(many.SeparateProcesses):
             def call(self, function, *args):
                 before(super().call, function, args[0])
                 return super().call(function, *args)
 
         monkeypatch.setattr(many, "SeparateProcesses", Watched)
+        monkeypatch.setattr(many, "available_cores", lambda: many.CORES_OF_STAGES + writers)
 
     monkeypatch.setattr(many, "leaves_cpu_free", lambda device: True)
-    monkeypatch.setattr(many, "available_cores", lambda: many.CORES_OF_STAGES + 2)
     return let
 
 
@@ -161,7 +161,7 @@ def test_a_process_that_writes_and_has_ended_ends_the_run_and_the_same_command_g
         if place.path.name == "b":
             call(os._exit, 9)
 
-    beside_gpu(end)
+    beside_gpu(end, writers=1)
     answer = geodiff(*COMMAND)
     assert answer.code == 2 and answer.err.count("geodiff: ") == 1
     assert "A process that writes results has ended (exit code 9). Is there enough memory?" in answer.err

@@ -1,4 +1,4 @@
-"""Pictures of README and the documentation.
+"""Pictures of README and the documentation; what computes is imported by those that need it.
 
 python -m tests.pictures rooms --data FOLDER
 python -m tests.pictures mistaken
@@ -16,11 +16,7 @@ import typer
 from geodiff_plugin.cli.commands import APPEARANCE
 from tests.pictures.badges import write_badges
 from tests.pictures.charts import write_charts
-from tests.pictures.gallery import write_rendered, write_room, write_slider, write_tiles, write_walls
-from tests.pictures.mistaken import write_mistaken
-from tests.pictures.moving import write_moving
 from tests.pictures.notebook import write_notebook
-from tests.pictures.rooms import ROOMS, room_named, solve
 
 IMAGES = Path("docs/images")
 #: The room of the moving picture, those of README's tiles, and that of prior beside guided depth.
@@ -42,6 +38,10 @@ def rooms(
     images: Images = IMAGES,
 ) -> None:
     """The moving picture, tiles, the gallery, the slider and walls: real rooms, and rendered scenes."""
+    from tests.pictures.gallery import write_rendered, write_room, write_slider, write_tiles, write_walls
+    from tests.pictures.moving import write_moving
+    from tests.pictures.rooms import ROOMS, room_named, solve
+
     results = {room.name: solve(data, room) for room in ROOMS}
     write_moving(results[MOVING], room_named(MOVING), images / "moving.webp")
     write_tiles([(room_named(name), results[name]) for name in TILES], images / "rooms.webp")
@@ -60,6 +60,8 @@ def mistaken(
     images: Images = IMAGES,
 ) -> None:
     """The page about one pair that is given with usual mistakes, and its picture."""
+    from tests.pictures.mistaken import write_mistaken
+
     write_mistaken(page, images, "python -m tests.pictures mistaken")
 
 
