@@ -140,7 +140,8 @@ class Trajectory:
             before = None if current is None else current.of(samples)
             valid = None if self.maps.valid is None else self.maps.valid[samples][:1]
             ranges.append(fit_depth_range(x[samples], judged, self.metric, self.config, before, valid))
-        return DepthRange(*(joined(values) for values in zip(*ranges, strict=True)))
+        near_m, far_m, on_edge = (joined(values) for values in zip(*ranges, strict=True))
+        return DepthRange(near_m, far_m, on_edge)
 
     @cached_property
     def _judged(self) -> list[Evidence]:

@@ -217,10 +217,10 @@ class _Guide:
     """An actor: it holds the prior, and makes the guided calls."""
 
     def __init__(self, options: DepthOptions) -> None:
-        self._held = _in_worker("jobs.held.HeldPrior")(options)
+        self._prior = _in_worker("jobs.actor.PriorOfJob")(options)
 
     def __call__(self, row: Row) -> Row:
-        return _hand_over(*attempt(row, self._held.guide))
+        return _hand_over(*attempt(row, self._prior.guide))
 
 
 def _encode(row: Row) -> Row:

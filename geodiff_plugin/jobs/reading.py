@@ -41,7 +41,7 @@ from geodiff_plugin.formats.reading import is_as_stored
 from geodiff_plugin.formats.recordings import both_halves
 from geodiff_plugin.formats.rigs import intrinsics, is_distorted
 from geodiff_plugin.jobs.options import DepthOptions, unique_names
-from geodiff_plugin.jobs.taken import fitting_rig
+from geodiff_plugin.jobs.rectified import fitting_rig
 from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.types import Distortion, Rig
 

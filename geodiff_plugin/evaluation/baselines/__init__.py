@@ -9,15 +9,8 @@ from typing import Any
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.config import DEFAULT, PAPER
-from geodiff_plugin.evaluation.baselines.guided import (
-    GUIDED_METHODS,
-    Method,
-    NotApplicable,
-    Prediction,
-    PriorCache,
-    Settings,
-    variant,
-)
+from geodiff_plugin.evaluation.baselines.guided import GUIDED_METHODS, variant
+from geodiff_plugin.evaluation.baselines.method import Method, NotApplicable, Prediction, PriorCache, Settings
 from geodiff_plugin.evaluation.baselines.unguided import STEREO_METHODS, files_method, hf_method
 
 __all__ = ["FAMILIES", "METHODS", "Method", "NotApplicable", "Prediction", "PriorCache", "Settings"]

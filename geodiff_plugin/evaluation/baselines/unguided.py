@@ -14,15 +14,14 @@ import torch
 import torch.nn.functional as F
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin.evaluation.baselines.guided import (
+from geodiff_plugin.evaluation.baselines.guided import guided_configuration, guided_map
+from geodiff_plugin.evaluation.baselines.method import (
     Method,
     NotApplicable,
     Prediction,
     PriorCache,
     Settings,
     folder_fingerprint,
-    guided_configuration,
-    guided_map,
 )
 from geodiff_plugin.evaluation.datasets.sample import StereoSample, disparity_to_depth, read_depth_m
 from geodiff_plugin.evidence.guidance import GeometryGuidance

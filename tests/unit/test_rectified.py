@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from geodiff_plugin._checks import noted
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.reading import read_pair
-from geodiff_plugin.jobs.taken import fitting_rig, off_lines_px
+from geodiff_plugin.jobs.rectified import fitting_rig, off_lines_px
 from tests.contracts.calibrations import read_texts
 
 SIZE = (640, 480)

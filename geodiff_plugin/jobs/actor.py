@@ -1,4 +1,4 @@
-"""What an actor of Ray holds: the prior of a job. Nothing here imports Ray."""
+"""The prior of a job, as an actor of Ray holds it. Nothing here imports Ray."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from geodiff_plugin.jobs.rows import GuidedPair, ReadPair
 from geodiff_plugin.runtime.machine import pick_device
 
 
-class HeldPrior:
+class PriorOfJob:
     """The prior that the options of a job name, for one guided call after the other."""
 
     def __init__(self, options: DepthOptions) -> None:

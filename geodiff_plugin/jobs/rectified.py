@@ -19,11 +19,12 @@ from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.tracks import FEWEST, LONG_SIDE, Tracks, epipolar, grey_image, sparse_tracks
 from geodiff_plugin.types import Rig
 
-#: Wrong matches lie anywhere: the better half of all is looked at, by its middle.
+#: Wrong matches lie anywhere, so the better half of all is looked at, by its middle.
 QUANTILE = 0.25
-#: The pictures are as taken where that leaves matches within so many pixels of their lines,
+#: The pictures may be as taken where the cameras as they stand leave matches within so many pixels of their
+#: epipolar lines.
 MOST_RESIDUAL_PX = 2.0
-#: and what rectification makes of the cameras leaves them further off by this factor.
+#: Then they are as taken if the rectified cameras leave the matches farther off by this factor.
 FURTHER_OFF = 3.0
 
 
