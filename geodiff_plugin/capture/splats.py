@@ -78,16 +78,7 @@ def write_splats(
     for split in SPLITS:
         if isinstance(kept.get(split), list):
             kept[split] = [renamed[path] for path in kept[split] if path in renamed]
-    thinned = cloud.thinned(MOST_POINTS)
-    parts = (thinned.points_m / capture.metres_per_unit, thinned.colours)
-    write_vertices(
-        folder / "points.ply",
-        "frame of transforms.json",
-        None,
-        len(thinned.points_m),
-        (*"xyz", "red", "green", "blue"),
-        [parts],
-    )
+    _write_points(folder / "points.ply", capture, cloud.thinned(MOST_POINTS))
     frames = [{key: value for key, value in entry.items() if key not in shared} for entry in entries]
     data = kept | {
         "camera_model": "OPENCV",
@@ -101,6 +92,12 @@ def write_splats(
     if capture.unit == "m":
         data["metres_per_unit"] = capture.metres_per_unit
     write_text(folder / "transforms.json", json.dumps(data, indent=2) + "\n")
+
+
+def _write_points(path: Path, capture: Capture, cloud: Cloud) -> None:
+    """Write a cloud in metres with the lengths that the capture came with."""
+    points, names = cloud.points_m / capture.metres_per_unit, (*"xyz", "red", "green", "blue")
+    write_vertices(path, "frame of transforms.json", None, len(points), names, [(points, cloud.colours)])
 
 
 def _write_frame(
