@@ -555,6 +555,12 @@ MESSAGES: dict[str, MessageKind] = {
         cure="Say where the images lie that the cameras are of (--images), or give the model of these.",
         forbids_trust=True,
     ),
+    "capture.assumed-metres": MessageKind(
+        "The lengths of a transforms.json are taken as metres",
+        cause="It names no unit, and no depth maps, which come from devices that measure in metres.",
+        cure="Nothing if they are metres. If its poses were solved from the images, or it was rendered in "
+        "another unit, give a length (--known-length, --distance, --metres-per-unit).",
+    ),
     "capture.gps-scale": MessageKind(
         "The capture was aligned with GPS",
         cause="OpenSfM fitted its reconstruction to positions that are exact to some metres.",

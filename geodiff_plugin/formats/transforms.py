@@ -1,7 +1,8 @@
 """``transforms.json`` of nerfstudio, instant-ngp and their converters, as a capture and as a calibration.
 
 Source: ``nerfstudio/data/dataparsers/nerfstudio_dataparser.py`` and ``scannetpp_dataparser.py`` of
-nerfstudio-project/nerfstudio, ``src/nerf_loader.cu`` and ``scripts/colmap2nerf.py`` of NVlabs/instant-ngp.
+nerfstudio-project/nerfstudio, ``src/nerf_loader.cu`` and ``scripts/colmap2nerf.py`` of NVlabs/instant-ngp,
+``data/load_scene.py`` of barbararoessle/dense_depth_priors_nerf.
 """
 
 from __future__ import annotations
@@ -59,15 +60,26 @@ UNDISTORTED_FOLDERS = ("undistorted_images", "resized_undistorted_images")
 DISTORTED_FOLDERS = ("resized_images", "original_images")
 #: What files call the map of known depths of a frame.
 DEPTHS = ("depth_file_path", "depth_path")
+#: By what dense_depth_priors_nerf divides them.
+DIVISOR = "depth_scaling_factor"
 DEPTH_SUFFIXES = (".png", ".npy", ".tiff", ".tif", ".exr")
 #: Entries that say a focal length.
-FOCALS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
+FOCALS = ("fl_x", "fl_y", "fx", "fy", "camera_angle_x", "camera_angle_y")
 #: The kind of these captures.
 TRANSFORMS = "transforms.json"
 #: Entries of a frame's camera as they are written: a pinhole in pixels, of OpenCV's model with no distortion.
 NERF_CAMERA = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")
 #: Further entries of cameras and lenses, which those replace.
-OTHERS_OF_CAMERA = ("k3", "k4", "distortion_params", "camera_model", "camera_angle_x", "camera_angle_y")
+OTHERS_OF_CAMERA = (
+    *("k3", "k4", "distortion_params", "camera_model"),
+    *("camera_angle_x", "camera_angle_y", "fx", "fy"),
+)
+#: What to say where neither the file nor depth maps of a sensor tell that its lengths are metres.
+ASSUMED_METRES = Message(
+    "capture.assumed-metres",
+    "The lengths of transforms.json are taken as metres, which it does not say. If its poses were solved "
+    "from the images, give a length (--known-length).",
+)
 Frame = dict[str, Any]
 
 
@@ -101,8 +113,9 @@ def nerf_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> Came
     focals = []
     for axis, side in zip("xy", size, strict=True):
         angle = frame.get(f"camera_angle_{axis}")
-        if f"fl_{axis}" in frame:
-            focals.append(frame[f"fl_{axis}"])
+        named = next((key for key in (f"fl_{axis}", f"f{axis}") if key in frame), None)
+        if named is not None:
+            focals.append(frame[named])
         elif angle is not None and not 0 < angle < math.pi:
             bad_value(f"camera_angle_{axis}", "in radians, between 0 and pi", angle, "Is it in degrees?")
         elif angle is not None:
@@ -175,6 +188,8 @@ def read_transforms(path: Path, images_at: Path | None = None) -> Layout | None:
     candidates = images.candidates(partial(_build, folder=file.parent), frames)
     solved = any(key in entries for entries in frames for key in OF_COLMAP) or any(map(_is_scaled, frames))
     notes = (*_notes(file), *images.notes)
+    if not solved and all(each.frame.depth is None for each in candidates):
+        notes = (*notes, ASSUMED_METRES)
     return Layout(TRANSFORMS, None if solved else "m", candidates, as_stored=True, notes=notes)
 
 
@@ -249,8 +264,10 @@ def _build(frame: CaptureFrame, entries: Frame, folder: Path) -> Candidate:
 
 
 def _depth_per_m(entries: Frame) -> float | None:
-    """Units of the depth maps in a metre, by either program's factor, which makes metres of them."""
+    """Units of the depth maps in a metre, by a program's factor, which makes metres of them, or divisor."""
     for key in ("depth_unit_scale_factor", "integer_depth_scale"):
         if entries.get(key) is not None:
             return 1.0 / float(check_positive(entries[key], key, "metres a unit"))
+    if entries.get(DIVISOR) is not None:
+        return float(check_positive(entries[DIVISOR], DIVISOR, "units a metre"))
     return None

@@ -124,6 +124,44 @@ FOREIGN = (
         "cameras of a BOP data set",
         "Write its cam_R_w2c and cam_t_w2c, in millimetres, as transforms.json.",
     ),
+    ForeignFormat(
+        ("*.txt",),
+        "poses of ACE0",
+        "Write them as transforms.json: w x y z and the translation are from the world to the camera.",
+        r"\A\S+\.(?i:jpe?g|png)(?:[ \t]+[-+.\deE]+){9}[ \t]*$",
+    ),
+    ForeignFormat(
+        ("*.txt",),
+        "a sequence of RealEstate10K",
+        "Write it as transforms.json: its fx fy cx cy are shares of the sides, its 3x4 from the world.",
+        r"\Ahttps?://\S+\s+\d+(?:[ \t]+[-+.\deE]+){18}",
+    ),
+    ForeignFormat(
+        ("ARKit_camera_pose.txt",),
+        "poses of ARKit Data Logger",
+        "Write them as transforms.json: they are camera-to-world, in OpenGL's axes.",
+    ),
+    ForeignFormat(
+        ("airsim_rec.txt",),
+        "a recording of AirSim",
+        "Write it as transforms.json: its world is north, east, down, its bodies forward, right, down.",
+    ),
+    ForeignFormat(
+        ("trainval_poses.txt",),
+        "a scene of Neural RGB-D",
+        "Write its poses as transforms.json: four rows each, camera-to-world, in OpenGL's axes.",
+    ),
+    ForeignFormat(("v1.0-*",), "a part of nuScenes", "Write one camera's poses as transforms.json."),
+    ForeignFormat(
+        ("city_SE3_egovehicle.feather",),
+        "a log of Argoverse 2",
+        "Write one camera's poses as transforms.json.",
+    ),
+    ForeignFormat(
+        ("data_poses", "cam0_to_world.txt"),
+        "poses of KITTI-360",
+        "Write them as transforms.json, or give two images to geodiff depth with --calib perspective.txt.",
+    ),
     ForeignFormat(("*.tfrecord",), "a recording of Waymo", "Write images and poses as transforms.json."),
     ForeignFormat(("*.hdf5", "*.h5"), "arrays in HDF5", "Write images and poses as transforms.json."),
     ForeignFormat(("*.traj",), "a trajectory of ARKitScenes", "Write it as transforms.json."),
@@ -190,7 +228,7 @@ def _has_content(file: Path, content: str) -> bool:
         return True
     with file.open("rb") as opened:
         head = opened.read(HEAD_BYTES).decode("utf-8-sig", errors="replace")
-    return re.search(content, head) is not None
+    return re.search(content, head, re.MULTILINE) is not None
 
 
 def _content(folder: Path) -> str:

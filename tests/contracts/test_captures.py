@@ -156,6 +156,8 @@ CONTENTS = {
     "cameras of RealityCapture": "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n",
     "a block of ContextCapture (BlocksExchange)": '<?xml version="1.0"?>\n<BlocksExchange version="3.2">',
     "a trajectory of Open3D": '{"class_name": "PinholeCameraTrajectory", "parameters": []}',
+    "poses of ACE0": "rgb/frame-000000.color.png 0.7 0.1 -0.7 0.1 1e-3 2.5 -0.4 525.0 9000\n",
+    "a sequence of RealEstate10K": "https://www.youtube.com/watch?v=a\n52553 " + "0.5 " * 17 + "0.5\n",
     "cameras of Virtual KITTI": "frame cameraID r1,1 r1,2 r1,3 t1\n",
 }
 

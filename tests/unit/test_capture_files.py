@@ -172,6 +172,32 @@ def test_units_and_lenses_of_transforms(tmp_path):
     assert capture.frames[0].depth == folder / "depth/f00.png"
 
 
+def test_lengths_of_transforms_without_depth_maps_are_said_to_be_taken_as_metres(tmp_path):
+    folder = write_transforms(tmp_path, TRUE, TRUE)
+    said = [note.code for note in Capture.open(folder).notes]
+    assert "capture.assumed-metres" not in said
+    shutil.rmtree(folder / "depth")
+    without = Capture.open(folder)
+    assert without.unit == "m" and [note.code for note in without.notes] == ["capture.assumed-metres"]
+    path = folder / "transforms.json"
+    path.write_text(path.read_text().replace('"transform_matrix"', '"sharpness": 9, "transform_matrix"'))
+    solved = Capture.open(folder)
+    assert solved.unit is None and not solved.notes
+
+
+def test_focal_lengths_of_each_frame_and_a_divisor_of_depth_maps_are_read(tmp_path):
+    """As dense_depth_priors_nerf has them."""
+    folder = write_transforms(tmp_path, TRUE, TRUE)
+    path = folder / "transforms.json"
+    data = json.loads(path.read_text())
+    shared = {new: data.pop(old) for new, old in (("fx", "fl_x"), ("fy", "fl_y"))}
+    data["frames"] = [frame | shared for frame in data["frames"]]
+    path.write_text(json.dumps(data | {"depth_scaling_factor": 4000.0}))
+    frame = Capture.open(folder).frames[1]
+    np.testing.assert_allclose(frame.K, K)
+    assert frame.depth_per_m == 4000
+
+
 def lose(folder: Path, data: dict) -> None:
     for i in range(3):
         (folder / f"images/f{i:02d}.png").unlink()
