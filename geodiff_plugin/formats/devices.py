@@ -73,9 +73,10 @@ def read_zed(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         keys = ZED_LENS if lens.keys() & set(ZED_LENS[5:]) else ZED_LENS[:5]
         K = intrinsics(*(section[key] for key in ("fx", "fy", "cx", "cy")))
         cameras.append(Camera(K, ZED_SIZES[name], [lens.get(key, 0.0) for key in keys]))
-    # Keys are small here; per resolution in some files (TY_HD), once for all in others (TY).
+    # Keys are small here; per resolution in some files (TY_HD), once for all in others (TY), and not at all
+    # in those of the first cameras.
     stereo, at = sections["STEREO"], f"_{name.lower()}"
-    shift = [stereo["baseline"], *(stereo.get(key + at, stereo.get(key)) for key in ("ty", "tz"))]
+    shift = [stereo["baseline"], *(stereo.get(key + at, stereo.get(key, 0.0)) for key in ("ty", "tz"))]
     turn = array_of([stereo[key + at] for key in ("rx", "cv", "rz")], (3,), "RX, CV, RZ of [STEREO]")
     shift_m = -array_of(shift, (3,), "Baseline, TY, TZ of [STEREO]") / MM_PER_METRE
     T = transform(Rotation.from_rotvec(turn).as_matrix(), shift_m, "[STEREO]")

@@ -40,6 +40,8 @@ UNITS = {
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
 }
 UNIT = f"({'|'.join(UNITS)})"
+#: Numbers of cameras as words.
+NUMBER_WORDS = ("zero", "one", "two")
 #: Words between those of a matrix and the side of its camera.
 CAMERA = "(?:cam(?:era)?)?"
 WORDS = {
@@ -61,7 +63,7 @@ BASELINE = f"(?:stereo)?baseline{UNIT}?"
 
 def _of(words: str, number: int, side: str) -> str:
     """Names of a matrix of one camera: its number, letter or side behind a word, or number or side before."""
-    behind = f"(?:{words}){CAMERA}(?:{number}|{side[0]}|{side}{CAMERA})"
+    behind = f"(?:{words}){CAMERA}(?:{number}|{NUMBER_WORDS[number]}|{side[0]}|{side}{CAMERA})"
     return f"{behind}|(?:{side}|{CAMERA}{number}){CAMERA}(?:{words})"
 
 
@@ -101,6 +103,9 @@ COUNTS = {
     "R_back": (3, 9),
     "T_back": (3,),
 }
+ROTATIONS = ("R", "R_back")
+#: A rotation that a file gives twice is equal to this in every number.
+SAME_TURN = 1e-4
 #: Those that may differ between the files of single cameras; which of them is meant nobody says, so none is.
 MAY_DIFFER = ("M", "D", "image_size", *SIDES)
 #: What files of single cameras say of both images.
@@ -133,6 +138,8 @@ def _named(arrays: Arrays) -> Entries:
         fits = [(key, v) for key, v in fits if re.fullmatch(words, _squeezed(key))]
         if name == "baseline":
             fits = _in_metres(fits)
+        if name in ROTATIONS:
+            fits = _without_vectors(fits)
         differ = any(not np.array_equal(v, fits[0][1]) for _, v in fits[1:])
         if differ and name in MAY_DIFFER:
             continue
@@ -142,6 +149,17 @@ def _named(arrays: Arrays) -> Entries:
         if fits:
             named[name] = fits[0][1]
     return named
+
+
+def _without_vectors(fits: Arrays) -> Arrays:
+    """The rotations without the rotation vectors that say the same as a matrix beside them."""
+    matrices = [v.reshape(3, 3) for _, v in fits if v.size == 9]
+
+    def is_said(vector: np.ndarray) -> bool:
+        turn = Rotation.from_rotvec(vector).as_matrix() if vector.size == 3 else None
+        return turn is not None and any(np.allclose(turn, R, atol=SAME_TURN) for R in matrices)
+
+    return [(key, v) for key, v in fits if not is_said(v)]
 
 
 def _unit_of_name(key: str) -> float | None:
@@ -211,7 +229,8 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     named = _named(arrays)
     sides = np.array([named[name].item() for name in SIDES if name in named])
     size = next((pair for pair in (named.get("image_size", sides), sides) if pair.size == 2), None)
-    if named.keys() >= {"P1", "P2"} and not any(_is_unused(named[name]) for name in ("P1", "P2")):
+    of_taken = named.keys() >= {"M1", "M2", "R", "T"}
+    if named.keys() >= {"P1", "P2"} and (not of_taken or _are_rectified(named)):
         rig = projected(named["P1"], named["P2"], size, size)
         if named.keys() >= {"M1", "M2", "D1", "D2"}:
             rig = _with_taken(rig, named, size)
@@ -225,9 +244,13 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     return in_stated_unit(rig, {key: value for entries in read for key, value in entries.items()}, choice)
 
 
-def _is_unused(P: np.ndarray) -> bool:
-    """Whether a projection has no focal lengths: programs that do not rectify write 0 or 1 there."""
-    return bool(max(P[0], P[5]) <= 1)
+def _are_rectified(named: Entries) -> bool:
+    """Whether both projections are those of rectified images: ``K [I | t]`` with focal lengths of pixels.
+
+    Programs that do not rectify write 0 or 1 there, and others ``K [R | t]`` of the images as taken.
+    """
+    both = [named[name].reshape(3, 4)[:, :3] for name in ("P1", "P2")]
+    return all(min(A[0, 0], A[1, 1]) > 1 and not A[(1, 2, 2), (0, 0, 1)].any() for A in both)
 
 
 def _with_taken(rig: Rig, named: Entries, size: Any) -> Rig:
@@ -242,9 +265,13 @@ def _with_taken(rig: Rig, named: Entries, size: Any) -> Rig:
 
 
 def _with_sides(read: list[Entries]) -> list[Entries]:
-    """The entries of files, of two files of one camera each beside that of their pose with left and right."""
+    """The entries of files, with left and right those of two files of one camera each.
+
+    Their pose stands in a third file, or both have the projections of the rectified images.
+    """
     alone = [n for n, entries in enumerate(read) if any(_is_camera(key) for key in entries)]
-    if len(read) != 3 or len(alone) != 2:
+    projected_pair = len(read) == 2 and all(map(_has_projection, read))
+    if len(alone) != 2 or not (len(read) == 3 or projected_pair):
         return read
     for n, side in zip(alone, ("left", "right"), strict=True):
         read[n] = {
@@ -255,6 +282,10 @@ def _with_sides(read: list[Entries]) -> list[Entries]:
 
 def _is_camera(key: str) -> bool:
     return bool(re.fullmatch(WORDS["M"], _squeezed(key)))
+
+
+def _has_projection(entries: Entries) -> bool:
+    return any(re.fullmatch(WORDS["P"], _squeezed(key)) for key in entries)
 
 
 def _is_posed(named: Entries) -> bool:

@@ -192,7 +192,8 @@ def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
     if len(texts) not in entry.file_counts:
         counts = " or ".join(map(str, entry.file_counts))
         twice = "Give --calib twice, for the left and the right view."
-        cure = twice if len(texts) == 1 else "A file of both cameras is given once."
+        once = "A file of both cameras is given once; of files of one camera each give K and E of the pair."
+        cure = twice if len(texts) == 1 else once
         expected = f"as many files as {entry.summary} has: {counts}"
         bad_value("calibration", expected, " and ".join(map(str, texts)), cure)
     return entry

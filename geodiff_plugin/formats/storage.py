@@ -177,13 +177,25 @@ def text_of_arrays(folder: Path) -> str:
     return json.dumps(matrices) if len(matrices) > 1 else ""
 
 
+def _is_of_objects(archive: zipfile.ZipFile, name: str) -> bool:
+    """Whether an array of an ``.npz`` holds objects of Python, which only unpickling would read."""
+    with archive.open(name) as opened:
+        return np.lib.format.read_magic(opened) == (1, 0) and bool(
+            np.lib.format.read_array_header_1_0(opened)[2].hasobject
+        )
+
+
 def text_of_npz(path: Path) -> str:
-    """The small arrays of an ``.npz`` as JSON, for ``read_opencv``; nothing is unpickled."""
+    """The small arrays of an ``.npz`` as JSON, for ``read_opencv``; nothing is unpickled.
+
+    Lists of pictures' corners and the like, which are objects, are left out.
+    """
     matrices: Entries = {}
     try:
         with zipfile.ZipFile(path) as archive, np.load(path, allow_pickle=False) as arrays:
             small = [each for each in archive.infolist() if each.file_size <= 8 * MOST_NUMBERS + NPY_HEAD]
-            for name in (each.filename.removesuffix(".npy") for each in small):
+            names = [each.filename for each in small if not _is_of_objects(archive, each.filename)]
+            for name in (each.removesuffix(".npy") for each in names):
                 value = arrays[name]
                 if value.dtype.kind in "fiu" and value.size <= MOST_NUMBERS:
                     matrices[name] = value.tolist()

@@ -181,6 +181,34 @@ def test_zed_takes_the_section_of_the_image(reading, tmp_path):
     assert reading(text, **ZED_HD).distortion[0].coefficients.tolist() == [1, 2, 3, 4, 5, 6, 0, 0]
 
 
+def test_the_first_zeds_have_no_shift_but_along_the_baseline(reading):
+    text = SAMPLES["zed"][0]
+    bare = re.sub(r"(?m)^(TY|TZ|p1|p2|k3)\w*=.*\n", "", text)
+    assert bare != text
+    rig = reading("\ufeff" + bare.replace("Baseline", "BaseLine"), **ZED_HD)
+    np.testing.assert_allclose(rig.E[:3, 3], (0.12, 0, 0), atol=1e-12)
+
+
+def test_ros_files_that_opencv_wrote_are_a_pair_by_their_projections(reading):
+    texts = []
+    for x in (0.0, -84.0):
+        head = "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n"
+        matrices = {
+            "camera_matrix": [[710.0, 0, 330], [0, 712, 250], [0, 0, 1]],
+            "distortion_coefficients": [[-0.2, 0.05, 0, 0, 0]],
+            "rectification_matrix": np.eye(3).tolist(),
+            "projection_matrix": [[700.0, 0, 320, x], [0, 700, 240, 0], [0, 0, 1, 0]],
+        }
+        for name, values in matrices.items():
+            numbers = ", ".join(map(str, np.ravel(values)))
+            head += f"{name}: !!opencv-matrix\n   rows: {len(values)}\n   cols: {len(values[0])}\n"
+            head += f"   dt: d\n   data: [ {numbers} ]\n"
+        texts.append(head)
+    rig = reading(*texts)
+    assert rig.E[0, 3] == pytest.approx(0.12) and rig.rectified and rig.size_left == (640, 480)
+    assert rig.as_taken.K_left[0, 0] == 710 and None not in rig.as_taken.distortion
+
+
 def test_realsense_models(reading):
     data = json.loads(SAMPLES["realsense"][0])
 

@@ -49,6 +49,7 @@ SETS_OF_NAMES = [
     ("left_intrinsics", "right_intrinsics", "left_distortion_coefficients", "right_distortion_coefficients",
      "rotation_left_to_right", "translation_left_to_right"),
     ("K0", "K1", "D0", "D1", "R", "T"),
+    ("camera_matrix_one", "camera_matrix_two", "dist_one", "dist_two", "R", "T"),
     ("intrinsic_matrix_cam1", "intrinsic_matrix_cam2", "dist_cam1", "dist_cam2", "R_l2r", "T_l2r"),
 ]  # fmt: skip
 
@@ -72,6 +73,29 @@ def test_outer_names_say_which_camera_is_which(tmp_path, sides):
         left: {"camera_matrix": LEFT, "distortion": LENS},
     }
     is_the_rig(read(tmp_path, cameras | {"stereo": {"R": R, "T": SHIFT_M}}))
+
+
+def test_a_rotation_vector_beside_its_matrix_is_no_contradiction(tmp_path):
+    cameras = {"K1": LEFT, "K2": RIGHT, "D1": LENS, "D2": LENS, "R": R, "T": SHIFT_M}
+    is_the_rig(read(tmp_path, cameras | {"rvec": TURN.as_rotvec().tolist()}))
+    with pytest.raises(InputError, match="R must be there once; got r, rvec, which differ"):
+        read(tmp_path, cameras | {"rvec": (2 * TURN.as_rotvec()).tolist()})
+
+
+def test_projections_of_images_as_taken_are_not_those_of_rectified_ones(tmp_path):
+    """``K [R | t]``, which programs that triangulate keep."""
+    P1 = np.column_stack([LEFT, np.zeros(3)])
+    P2 = np.array(RIGHT) @ np.column_stack([R, SHIFT_M])
+    cameras = {"K1": LEFT, "K2": RIGHT, "D1": LENS, "D2": LENS, "R": R, "T": SHIFT_M}
+    is_the_rig(read(tmp_path, cameras | {"P1": P1.tolist(), "P2": P2.tolist()}))
+
+
+def test_arrays_of_objects_in_an_archive_are_left_out_and_not_unpickled(tmp_path):
+    arrays = {"K1": LEFT, "K2": RIGHT, "D1": LENS, "D2": LENS, "R": R, "T": SHIFT_M}
+    corners = np.empty(2, dtype=object)
+    corners[:] = [np.zeros((3, 2)), None]
+    np.savez(tmp_path / "calib.npz", corners=corners, **arrays)
+    is_the_rig(read_calibration(tmp_path / "calib.npz", distorted=True))
 
 
 def test_a_pose_from_the_right_camera_to_the_left_one_is_not_inverted(tmp_path):
