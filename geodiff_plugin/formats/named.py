@@ -54,7 +54,7 @@ WORDS = {
 FORTH = "(?:stereo|relative|lefttoright|ltor|l2r|1to2)?"
 #: From the right one to the left: the right camera's pose in the left camera's frame.
 BACK = "(?:righttoleft|rtol|r2l|2to1)"
-ROTATION = "(?:stereo)?(?:r|rot|rotation|om|rvec)(?:mat|matrix|vec|vector)?"
+ROTATION = "(?:stereo)?(?:r|rot|rotate|rotation|om|rvec)(?:mat|matrix|vec|vector)?"
 TRANSLATION = "(?:stereo)?(?:t|tvec|trans|transl|translation)(?:mat|matrix|vec|vector)?"
 #: Lengths, whose names may end with their unit.
 T_FORTH, T_BACK = (f"{TRANSLATION}{way}{UNIT}?" for way in (FORTH, BACK))
@@ -120,6 +120,8 @@ LIKELY_BASELINE_M = (0.02, 5.0)
 LONGEST_UNSTATED_M = 1.5
 #: Lengths of one thing that a file gives twice are equal to this share.
 SAME_LENGTH = 0.03
+#: Principal points tell how a size is written where one way has them by this factor nearer to the middle.
+CLEARLY = 0.5
 #: Matrices that a message lists.
 MOST_LISTED = 8
 
@@ -227,8 +229,7 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     read = _with_sides([read_storage(text) for text in texts])
     arrays = [item for entries in read for item in entries.items() if isinstance(item[1], np.ndarray)]
     named = _named(arrays)
-    sides = np.array([named[name].item() for name in SIDES if name in named])
-    size = next((pair for pair in (named.get("image_size", sides), sides) if pair.size == 2), None)
+    size = _size_of(named, choice)
     of_taken = named.keys() >= {"M1", "M2", "R", "T"}
     if named.keys() >= {"P1", "P2"} and (not of_taken or _are_rectified(named)):
         rig = projected(named["P1"], named["P2"], size, size)
@@ -242,6 +243,24 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         left, right = (Camera(_matrix(named[name], name), size, lens) for name, lens in lenses)
         rig = make_rig(left, right, _pose(named))
     return in_stated_unit(rig, {key: value for entries in read for key, value in entries.items()}, choice)
+
+
+def _size_of(named: Entries, choice: CameraChoice) -> Any:
+    """Width and height of the images, ``None`` if unknown; some programs write numpy's shape, height first.
+
+    That is told by the principal points, which lie near the middle, unless the image says otherwise.
+    """
+    sides = np.array([named[name].item() for name in SIDES if name in named])
+    size = named.get("image_size", sides)
+    if size.size != 2:
+        return sides if sides.size == 2 else None
+    at = {4: [2, 3], 9: [2, 5]}  # cx and cy among the numbers of a matrix
+    found = [named[name] for name in ("M1", "M2", "M") if name in named]
+    centres = np.array([K[at[K.size]] for K in found if K.size in at]).reshape(-1, 2)
+    off, off_turned = (np.abs(centres - each / 2).sum() for each in (size, size[::-1]))
+    width, height = choice.image_size or size[::-1]
+    is_turned = off_turned < CLEARLY * off and (width > height) == (size[1] > size[0])
+    return size[::-1] if is_turned else size
 
 
 def _are_rectified(named: Entries) -> bool:

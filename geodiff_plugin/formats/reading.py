@@ -129,7 +129,8 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         "VINS-Fusion's configuration (cam0_calib, body_T_cam0)", r"^(cam0_calib|model_type)\s*:",
         robotics.read_vins, beside=robotics.vins_cameras),
     "kalibr": CalibrationFormat(
-        "Kalibr camchain.yaml (cam0)", r"^cam\d+:\s*(?:#.*)?$", robotics.read_kalibr, uses_cameras=True),
+        "Kalibr camchain.yaml (cam0)", r"^cam\d+:\s*(?:#.*)?$|^[ \t]+T_cn_cnm1[ \t]*:", robotics.read_kalibr,
+        uses_cameras=True),
     "euroc": CalibrationFormat("pair of EuRoC sensor.yaml (T_BS)", r"^T_BS\s*:", robotics.read_euroc, (2,)),
     # Older settings describe the rectification too, and OpenCV's reader has these names.
     "orb_slam": CalibrationFormat(

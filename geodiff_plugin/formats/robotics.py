@@ -53,8 +53,13 @@ def _pinhole(entries: Entries, coefficients: str) -> Camera:
 
 
 def read_kalibr(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
-    """Two cameras of a chain, cam0 and cam1 unless chosen, in metres."""
-    chain = read_yaml(texts[0])
+    """Two cameras of a chain, cam0 and cam1 unless chosen, in metres.
+
+    D-Robotics' stereo cameras have the chain below a name of its own.
+    """
+    content = read_yaml(texts[0])
+    below = (each for each in content.values() if isinstance(each, dict) and "cam0" in each)
+    chain = content if "cam0" in content else next(below, content)
     pair = two_cameras(choice, [n for n in range(len(chain)) if f"cam{n}" in chain], (0, 1))
     left, right = (_pinhole(chain[f"cam{n}"], "distortion_coeffs") for n in pair)
     poses = _poses_of_chain(chain, max(pair) + 1)

@@ -101,6 +101,11 @@ def kalibr_cam_imu(rig: Drawn) -> tuple[str, ...]:
     return kalibr_openvins(rig, "T_cam_imu")
 
 
+def kalibr_below(rig: Drawn) -> tuple[str, ...]:
+    """The chain of D-Robotics' stereo cameras."""
+    return ("%YAML:1.0\n" + yaml.safe_dump({"stereo0": yaml.safe_load(kalibr(rig)[0])}),)
+
+
 def kalibr_mins(rig: Drawn) -> tuple[str, ...]:
     """MINS' config_camera.yaml: OpenVINS' chain without models of cameras, below its own settings."""
     chain = yaml.safe_load(kalibr_openvins(rig)[0].partition("\n")[2])
@@ -651,7 +656,8 @@ ANY_POSE = (
     *(vins, vins_fisheye, matlab, matlab_pose, named, named_by_side),
     *(okvis, okvis_fisheye, svo, svo_inverse, svo_fisheye, airslam, airslam_fisheye),
     *(anipose, anipose_fisheye, anipose_caliscope, mrcal, stvo),
-    *(mc_calib, mc_calib_fisheye, multical, multical_relative, bouguet, svo_sensors, kalibr_mins),
+    *(mc_calib, mc_calib_fisheye, multical, multical_relative, bouguet, svo_sensors),
+    *(kalibr_mins, kalibr_below),
 )
 RECTIFIED = (
     *(middlebury, middlebury_blanks, kitti_cam_to_cam, kitti_projections, booster, stereodemo, ros, ros_echo),

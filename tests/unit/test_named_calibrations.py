@@ -48,7 +48,7 @@ SETS_OF_NAMES = [
     ("cameraMatrix1", "cameraMatrix2", "distCoeffs1", "distCoeffs2", "stereo_R", "stereo_T"),
     ("left_intrinsics", "right_intrinsics", "left_distortion_coefficients", "right_distortion_coefficients",
      "rotation_left_to_right", "translation_left_to_right"),
-    ("K0", "K1", "D0", "D1", "R", "T"),
+    ("K0", "K1", "D0", "D1", "Rotate", "Trans"),
     ("camera_matrix_one", "camera_matrix_two", "dist_one", "dist_two", "R", "T"),
     ("intrinsic_matrix_cam1", "intrinsic_matrix_cam2", "dist_cam1", "dist_cam2", "R_l2r", "T_l2r"),
 ]  # fmt: skip
@@ -88,6 +88,14 @@ def test_projections_of_images_as_taken_are_not_those_of_rectified_ones(tmp_path
     P2 = np.array(RIGHT) @ np.column_stack([R, SHIFT_M])
     cameras = {"K1": LEFT, "K2": RIGHT, "D1": LENS, "D2": LENS, "R": R, "T": SHIFT_M}
     is_the_rig(read(tmp_path, cameras | {"P1": P1.tolist(), "P2": P2.tolist()}))
+
+
+@pytest.mark.parametrize(("written", "expected"), [((800, 600), (800, 600)), ((600, 800), (800, 600))])
+def test_a_size_may_be_written_height_first(tmp_path, written, expected):
+    cameras = {"K1": LEFT, "K2": RIGHT, "D1": LENS, "D2": LENS, "R": R, "T": SHIFT_M, "image_size": written}
+    assert read(tmp_path, cameras).size_left == expected
+    upright = read_texts(tmp_path, json.dumps(cameras), distorted=True, image_size=written)
+    assert upright.size_left == (expected if written == expected else written)
 
 
 def test_arrays_of_objects_in_an_archive_are_left_out_and_not_unpickled(tmp_path):
