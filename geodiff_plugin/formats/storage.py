@@ -201,4 +201,7 @@ def text_of_npz(path: Path) -> str:
                     matrices[name] = value.tolist()
     except Exception as error:  # of any kind that a damaged archive leads to
         bad_value("calibration", "a whole .npz of matrices", f"{path} ({error})", "Is it cut off?")
+    if not matrices and len(names) < len(small):
+        got = f"{path} of pickled objects, which are never loaded"
+        bad_value("calibration", "a .npz of matrices", got, "Save every matrix as an array (numpy.savez).")
     return json.dumps(matrices)
