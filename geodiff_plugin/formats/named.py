@@ -248,7 +248,8 @@ def read_opencv(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
 def _size_of(named: Entries, choice: CameraChoice) -> Any:
     """Width and height of the images, ``None`` if unknown; some programs write numpy's shape, height first.
 
-    That is told by the principal points, which lie near the middle, unless the image says otherwise.
+    So it is where the image is of the turned shape, and the principal points lie nearer to its middle:
+    images that were turned themselves have them as far from it.
     """
     sides = np.array([named[name].item() for name in SIDES if name in named])
     size = named.get("image_size", sides)
@@ -258,8 +259,8 @@ def _size_of(named: Entries, choice: CameraChoice) -> Any:
     found = [named[name] for name in ("M1", "M2", "M") if name in named]
     centres = np.array([K[at[K.size]] for K in found if K.size in at]).reshape(-1, 2)
     off, off_turned = (np.abs(centres - each / 2).sum() for each in (size, size[::-1]))
-    width, height = choice.image_size or size[::-1]
-    is_turned = off_turned < CLEARLY * off and (width > height) == (size[1] > size[0])
+    width, height = choice.image_size or size
+    is_turned = (width > height) != (size[0] > size[1]) and off_turned < CLEARLY * off
     return size[::-1] if is_turned else size
 
 

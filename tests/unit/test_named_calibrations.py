@@ -93,9 +93,12 @@ def test_projections_of_images_as_taken_are_not_those_of_rectified_ones(tmp_path
 @pytest.mark.parametrize(("written", "expected"), [((800, 600), (800, 600)), ((600, 800), (800, 600))])
 def test_a_size_may_be_written_height_first(tmp_path, written, expected):
     cameras = {"K1": LEFT, "K2": RIGHT, "D1": LENS, "D2": LENS, "R": R, "T": SHIFT_M, "image_size": written}
-    assert read(tmp_path, cameras).size_left == expected
-    upright = read_texts(tmp_path, json.dumps(cameras), distorted=True, image_size=written)
-    assert upright.size_left == (expected if written == expected else written)
+    assert read(tmp_path, cameras).size_left == written
+    for image_size in ((800, 600), (400, 300)):
+        rig = read_texts(tmp_path, json.dumps(cameras), distorted=True, image_size=image_size)
+        assert rig.size_left == expected
+    turned = read_texts(tmp_path, json.dumps(cameras), distorted=True, image_size=(600, 800))
+    assert turned.size_left == written
 
 
 def test_arrays_of_objects_in_an_archive_are_left_out_and_not_unpickled(tmp_path):
