@@ -74,10 +74,19 @@ class Beside(Generic[T]):
         device: on which it works.
         own_stream: its work on CUDA goes to a stream beside the caller's, after what the caller has asked of
             the device until now. What it reads from the device then does not wait for the caller's network.
+        follows: ``False`` where it reads nothing from the device that the caller has made. Then its own
+            stream waits for nothing, neither for what other threads have asked of the caller's.
     """
 
-    def __init__(self, function: Callable[[], T], device: torch.device, *, own_stream: bool = False) -> None:
-        self._stream = None
+    def __init__(
+        self,
+        function: Callable[[], T],
+        device: torch.device,
+        *,
+        own_stream: bool = False,
+        follows: bool = True,
+    ) -> None:
+        self._stream, self._waiting = None, set[torch.cuda.Stream]()
         if not leaves_cpu_free(device):
             self._answer = Future[T]()
             self._answer.set_result(function())
@@ -86,7 +95,8 @@ class Beside(Generic[T]):
         if device.type == "cuda":
             self._stream = torch.cuda.current_stream(device)
             if own_stream:
-                ready, self._stream = self._stream.record_event(), _stream_beside(device)
+                ready = self._stream.record_event() if follows else None
+                self._stream = _stream_beside(device)
 
         def work() -> T:
             with torch.no_grad(), torch.cuda.stream(self._stream):
@@ -108,18 +118,21 @@ class Beside(Generic[T]):
         answer = self._answer.result()
         if self._stream is not None:
             stream = torch.cuda.current_stream(self._stream.device)
-            if stream != self._stream:
+            if stream != self._stream and stream not in self._waiting:
                 stream.wait_stream(self._stream)
                 for tensor in tensors_of(answer):  # else their memory could be given away while they are read
                     if tensor.is_cuda:
                         tensor.record_stream(stream)
-            self._stream = None  # once is enough
+                self._waiting.add(stream)
         return answer
 
     def close(self) -> None:
-        """Wait until its work and that which its answer holds have ended, whether anybody asked or not."""
+        """Wait until its work and that which its answer holds have ended, whether anybody asked or not.
+
+        The caller's stream waits as well: the memory of what was read is not given away before.
+        """
         if self._answer.exception() is None:
-            for part in _parts_of(self._answer.result()):
+            for part in _parts_of(self.result()):
                 if isinstance(part, Beside):
                     part.close()
 

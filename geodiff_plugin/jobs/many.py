@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ import torch
 from geodiff_plugin._checks import InputError, refuse
 from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin._threads import Beside, WithinCores, available_cores, leaves_cpu_free
+from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.formats.out import OutFolder
@@ -93,6 +95,7 @@ class Stages:
         writers: int = 0,
     ) -> None:
         self._options, self._device, self._pipe = options, device, pipe
+        self._works_on: torch.device | None = None  # the pipeline
         self._among, self._tell = among, tell
         self._views, self._folders = Views(options), dict[str, ExitStack]()
         self._writers = SeparateProcesses(write_row.__module__, writers) if writers else None
@@ -136,13 +139,16 @@ class Stages:
                 self._pipe = prior_of_options(replace(self._options, graphs=graphs), self._device, tell)
             except Exception as error:
                 raise _EndsRun from error
-        device, guidance = self._pipe._execution_device, pair.inputs.guidance
+        if self._works_on is None:
+            self._works_on = self._pipe._execution_device  # looks through all layers
+        device, guidance, left = self._works_on, pair.inputs.guidance, pair.inputs.left
         plain, kernels = torch.autocast(device.type, enabled=False), without_kernels(self._options.no_kernels)
         with pair.log.stage("evidence"), WithinCores(self._among), torch.no_grad(), plain, kernels:
             guidance.evidence_store = EvidenceStore(1, copies=False)
-            lefts_01 = left_images(pair.inputs.left).to(device)
-            # What it reads from a GPU does not wait for the pair before, which is still guided there.
-            Beside(lambda: guidance.prepare(lefts_01), device, own_stream=True).result()
+            # All threads have one stream by default, to which the pair before is still sent, and waiting for
+            # its network would leave nothing of working side by side.
+            work = functools.partial(_prepare, guidance, left, device)
+            Beside(work, device, own_stream=True, follows=False).result()
         return pair
 
     def guide(self, pair: _OnItsWay) -> _OnItsWay:
@@ -173,6 +179,11 @@ def count_writers(device: torch.device, pairs: int, processes: int) -> int:
     if not leaves_cpu_free(device):
         return 0
     return min(pairs, MOST_WRITERS, max(1, available_cores() // processes - CORES_OF_STAGES))
+
+
+def _prepare(guidance: GeometryGuidance, left: Any, device: torch.device) -> None:
+    """Work the evidence of a left image out on a device; the guidance keeps it in its store."""
+    guidance.prepare(left_images(left).to(device))
 
 
 def _refuse_one_length(options: DepthOptions, refs: Sequence[PairRef]) -> None:

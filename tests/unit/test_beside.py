@@ -131,6 +131,30 @@ def test_on_a_card_the_callers_stream_waits_for_the_answer_and_keeps_its_tensors
     ]
 
 
+def test_every_stream_that_asks_waits_for_the_answer(card):
+    """As that of another thread does, whose pipeline shares the guidance."""
+    answer = Beside(lambda: torch.zeros(2).as_subclass(OnCard), card.device, own_stream=True)
+    answer.result()
+    now.stream = Stream("another", card.said, card.device)
+    before = len(card.said)
+    for _ in range(2):
+        answer.result()
+    assert card.said[before:] == [("another", "waits for beside"), ("another", "keeps the tensor")]
+
+
+def test_the_stream_of_who_closes_waits_for_what_nobody_asked_for(card):
+    """Else the memory that the work still reads could be given away."""
+    answer = Beside(lambda: torch.zeros(2), card.device, own_stream=True)
+    answer.close()
+    assert card.said[-1] == ("caller", "waits for beside")
+
+
+def test_work_that_reads_nothing_of_the_caller_waits_for_nothing_on_its_stream(card):
+    answer = Beside(lambda: now.stream.name, card.device, own_stream=True, follows=False)
+    assert answer.result() == "beside"
+    assert card.said == [("caller", "waits for beside")]
+
+
 def test_without_a_stream_of_its_own_the_work_goes_to_the_callers(card):
     answer = Beside(lambda: now.stream.name, card.device)
     assert answer.result() == "caller" and card.said == []
