@@ -10,6 +10,7 @@ written in the launch is read past the first cache (``.cg``), which other multip
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -508,14 +509,19 @@ def _sizes(height: int, width: int, levels: bool) -> list[tuple[int, int]]:
     return sizes
 
 
+def _scratch_size(batch: int, fields: int, pixels: Sequence[int]) -> int:
+    """Values that a launch works in, for grids of so many pixels."""
+    stored = (3 * batch + 2 * fields) * sum(pixels)
+    return stored + fields * (WORK_ARRAYS.value * pixels[0] + SUMS.value * triton.cdiv(pixels[0], TILE))
+
+
 def _launch(read: _Read, written: tuple[Tensor, Tensor, Tensor], counts: _Counts, robust: bool) -> None:
     """``solve_kernel`` into field, support and weights; the latter two are those of ``robust`` solves."""
     batch, _, height, width = read.weight.shape
     pixels = [rows * columns for rows, columns in _sizes(height, width, not counts.given)]
     fields = batch * counts.channels
     tiles = triton.cdiv(pixels[0], TILE) * fields
-    stored = (3 * batch + 2 * fields) * sum(pixels)
-    scratch = read.data.new_empty(stored + WORK_ARRAYS.value * fields * pixels[0] + SUMS.value * tiles)
+    scratch = read.data.new_empty(_scratch_size(batch, fields, pixels))
     arrivals = torch.zeros(1, dtype=torch.int32, device=scratch.device)
     options = {"num_warps": WARPS}
     if scratch.is_cuda:  # the interpreter knows neither

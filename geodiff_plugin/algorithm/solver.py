@@ -18,6 +18,9 @@ from geodiff_plugin._kernels import use_kernel
 COARSEST_SIDE = 24
 #: Its conjugate-gradient steps: near enough to exact.
 COARSEST_STEPS = 80
+#: Values of all fields for which the kernel is used, at most. It works in 13 times as much memory, whose
+#: places it counts in 32 bits.
+MOST_VALUES = (1 << 31) // 13
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ def solve_field(system: FieldSystem, steps: int, start: Tensor | None = None) ->
 
     Without ``start``, a field near the solution, coarser grids are solved first. The work is fixed.
     """
-    if use_kernel(system.pull):
+    if use_kernel(system.pull) and system.pull.numel() <= MOST_VALUES:
         from geodiff_plugin.algorithm import kernels
 
         return kernels.solve_field(system, steps, start)
@@ -147,7 +150,7 @@ def solve_robust(system: RobustSystem, rounds: int, steps: int, *, with_support:
     The first round of the first pass trusts every observation, that of a later one starts with the weights of
     the pass before. ``steps`` are those of ``solve_field``, whose field the next round starts from.
     """
-    if use_kernel(system.data):
+    if use_kernel(system.data) and (1 + with_support) * system.trusted.numel() <= MOST_VALUES:
         from geodiff_plugin.algorithm import kernels
 
         return kernels.solve_robust(system, rounds, steps, with_support)

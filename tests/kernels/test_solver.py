@@ -148,3 +148,29 @@ def test_a_stiff_system_is_solved_as_well_as_by_the_reference(device):
         exact = solve_field(FieldSystem(*(part.double() for part in vars(system).values())), 4)
     errors = [(field - exact).abs().max() for field in (found, expected)]
     assert errors[0] <= 3 * errors[1] + 1e-6 * exact.abs().max()
+
+
+@pytest.mark.parametrize(("batch", "channels"), [(1, 1), (1, 2), (2, 1), (4, 2)])
+def test_the_kernel_counts_its_places_in_32_bits(monkeypatch, batch: int, channels: int) -> None:
+    from geodiff_plugin.algorithm import kernels
+
+    monkeypatch.setattr(kernels, "TILE", 1024)
+    fields = batch * channels
+    side = int((solver.MOST_VALUES / fields) ** 0.5)
+    pixels = [rows * columns for rows, columns in kernels._sizes(side, side, True)]
+    assert 2**30 < kernels._scratch_size(batch, fields, pixels) < 2**31
+
+
+def test_larger_fields_than_the_kernel_can_address_are_those_of_the_reference(monkeypatch, device) -> None:
+    from geodiff_plugin.algorithm import kernels
+
+    system = random_system(0, (8, 15), 1, 1, device)
+    robust = random_robust_system(0, (1, 8, 15), 1, 1, device, local=False)
+    launched = []
+    monkeypatch.setattr(kernels, "_launch", lambda *args, **kwargs: launched.append(1))
+    for most, count in ((120, 2), (119, 0)):
+        monkeypatch.setattr(solver, "MOST_VALUES", most)
+        launched.clear()
+        solve_field(system, 2, system.pull)
+        solve_robust(robust, 1, 2)
+        assert len(launched) == count
