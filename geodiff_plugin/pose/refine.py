@@ -135,6 +135,7 @@ class PoseFit:
     greys: PosedGreys
     tracks: Tracks  # by SIFT
     residual_px: np.ndarray  # (V,) median distance of matches from their epipolar lines, NaN where too few
+    rig: bool  # a rectified one
     surely: bool = False  # whether ``surely_fits`` says so, where the residuals do not
 
     @property
@@ -143,14 +144,9 @@ class PoseFit:
         return bool(self.tracks.seen.sum(1).max(initial=0) >= FEWEST)
 
     @property
-    def rig(self) -> bool:
-        """Whether the poses are those of a rectified one."""
-        return is_rig(self.tracks, self.greys.given)
-
-    @property
     def limit_px(self) -> float:
         """Residual up to which a pose fits."""
-        return _limit_px(self.tracks, self.greys.given)
+        return FITS_PX if self.rig else POSED_FITS_PX
 
     @property
     def fits(self) -> bool:
@@ -158,8 +154,10 @@ class PoseFit:
         return self.surely or not (self.residual_px > self.limit_px).any()
 
 
-def _limit_px(tracks: Tracks, given: np.ndarray) -> float:
-    return FITS_PX if is_rig(tracks, given) else POSED_FITS_PX
+def _fit_at(greys: PosedGreys, scale: float) -> PoseFit:
+    """How the poses fit features of pictures of a scale."""
+    tracks = sparse_tracks(greys.views, scale)
+    return PoseFit(greys, tracks, median_residuals(tracks, greys.given), is_rig(tracks, greys.given))
 
 
 def surely_fits(greys: PosedGreys) -> bool:
@@ -168,9 +166,8 @@ def surely_fits(greys: PosedGreys) -> bool:
     They are fewer, and their residuals larger: the answer ``False`` says nothing. ``True`` says it before the
     features of the pictures themselves are matched, of which all else is measured.
     """
-    tracks = sparse_tracks(greys.views, SMALLER)
-    limit_px = SURELY * _limit_px(tracks, greys.given)
-    return bool((median_residuals(tracks, greys.given) <= limit_px).all())
+    fit = _fit_at(greys, SMALLER)
+    return bool((fit.residual_px <= SURELY * fit.limit_px).all())  # not where it is NaN
 
 
 def measure_fit(greys: PosedGreys, surely: Callable[[], bool] | None = None) -> PoseFit:
@@ -178,8 +175,7 @@ def measure_fit(greys: PosedGreys, surely: Callable[[], bool] | None = None) -> 
 
     ``surely`` gives the answer of ``surely_fits`` where it is worked out already.
     """
-    tracks = sparse_tracks(greys.views)
-    fit = PoseFit(greys, tracks, median_residuals(tracks, greys.given))
+    fit = _fit_at(greys, 1.0)
     if fit.fits:
         return fit
     return replace(fit, surely=surely_fits(greys) if surely is None else surely())
