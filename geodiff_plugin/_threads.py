@@ -20,6 +20,8 @@ import torch
 from torch import Tensor
 
 T = TypeVar("T")
+#: More pieces of work than there ever are at a time: with fewer threads they could wait for each other.
+MOST_BESIDE = 1 << 16
 
 
 def available_cores() -> int:
@@ -61,7 +63,7 @@ def leaves_cpu_free(device: torch.device) -> bool:
 
 
 class Beside(Generic[T]):
-    """The answer of a function that a thread of its own works out while the caller goes on.
+    """The answer of a function that another thread works out while the caller goes on.
 
     A guided call on CUDA makes its evidence like this, beside the network's first steps, which are not
     guided; in it the features of the pose check, which keep the CPU busy while the GPU matches; and after it
@@ -104,9 +106,7 @@ class Beside(Generic[T]):
                     ready.wait()
                 return context.run(function)
 
-        pool = ThreadPoolExecutor(1, thread_name_prefix="geodiff-evidence")
-        self._answer = pool.submit(work)
-        pool.shutdown(wait=False)  # the thread ends with its work, even if nobody asks for the answer
+        self._answer = _in_new_thread(work) if own_stream else _threads_beside(os.getpid()).submit(work)
 
     @classmethod
     def known(cls, answer: T) -> Beside[T]:
@@ -135,6 +135,24 @@ class Beside(Generic[T]):
             for part in _parts_of(self.result()):
                 if isinstance(part, Beside):
                     part.close()
+
+
+def _in_new_thread(work: Callable[[], T]) -> Future[T]:
+    """Its answer; the thread gives back at its end what CUDA's libraries keep for it, memory among it."""
+    pool = ThreadPoolExecutor(1, thread_name_prefix="geodiff-evidence")
+    answer = pool.submit(work)
+    pool.shutdown(wait=False)  # it ends with its work, even if nobody asks for the answer
+    return answer
+
+
+@functools.cache
+def _threads_beside(process: int) -> ThreadPoolExecutor:
+    """Threads of a process for work of the CPU, one more where all are busy: one may wait for another.
+
+    They stay for what comes next. To start one takes long while others have Python's lock, and who starts it
+    waits meanwhile.
+    """
+    return ThreadPoolExecutor(MOST_BESIDE, thread_name_prefix="geodiff-beside")
 
 
 @functools.cache

@@ -182,6 +182,20 @@ def test_closing_waits_for_the_work_and_what_it_raised_is_for_whoever_asks(card)
         answer.result()
 
 
+def test_a_thread_stays_for_the_next_work(card):
+    first = Beside(threading.get_ident, card.device).result()
+    deadline = time.monotonic() + 30
+    while Beside(threading.get_ident, card.device).result() != first:  # it may not be idle at once
+        assert time.monotonic() < deadline
+
+
+def test_work_may_wait_for_other_work_however_deep(card):
+    def depth(left: int) -> int:
+        return left and 1 + Beside(lambda: depth(left - 1), card.device).result()
+
+    assert Beside(lambda: depth(100), card.device).result() == 100
+
+
 def test_closing_waits_for_the_threads_that_an_answer_holds(card):
     ended = []
 
