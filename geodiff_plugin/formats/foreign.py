@@ -61,7 +61,7 @@ FOREIGN_CALIBRATIONS = (
         "Give what rs-enumerate-devices -c prints.",
     ),
     ForeignCalibration(
-        r'\A\s*[\[{](?=[\s\S]*"transform")(?=[\s\S]*"intrinsics")[\s\S]*"distortion_model"',
+        r'\A\s*\[(?=[\s\S]*"transform")(?=[\s\S]*"intrinsics")[\s\S]*"distortion_model"',
         "a rig of cuVSLAM (.edex)",
         f"Rectify its images and give --fx --fy --cx --cy and --baseline. {OF_PAIR}",
     ),
@@ -76,12 +76,12 @@ FOREIGN_CALIBRATIONS = (
         f"Its R and t are from the world to the camera, in centimetres. {OF_PAIR}",
     ),
     ForeignCalibration(
-        r'"extrinsic_r"',
+        r'\A\s*\{\s*"class_name"[\s\S]*"extrinsic_r"',
         "a camera of XRPrimer",
         f"If world2cam is true, extrinsic_r and extrinsic_t are from the world to the camera. {OF_PAIR}",
     ),
     ForeignCalibration(
-        r'"camera_intrinsic"|\A\s*\{\s*"extrinsics"\s*:\s*\[\s*\{\s*"rotation"',
+        r'\A\s*\[[\s\S]*"camera_intrinsic"|\A\s*\{\s*"extrinsics"\s*:\s*\[\s*\{\s*"rotation"',
         "cameras of a vehicle's frame (nuScenes, DGP)",
         OF_PAIR,
     ),

@@ -71,7 +71,7 @@ def read_anipose(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     caliscope has them in a table ``cameras``, with a rotation of 9 numbers.
     """
     content = tomllib.loads(texts[0])
-    content = content.get("cameras", content)
+    content = content["cameras"] if isinstance(content.get("cameras"), dict) else content
     tables = [
         (name, table) for name, table in content.items() if isinstance(table, dict) and "matrix" in table
     ]

@@ -44,9 +44,10 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
         "Middlebury or ETH3D calib.txt (cam0=[...])", r"^\s*cam0\s*=\s*\[", stereo.read_middlebury),
     "kitti_cam_to_cam": CalibrationFormat(
         "KITTI (P_rect_02: ...)", r"^\s*P_rect_\d+\s*:", stereo.read_kitti, uses_cameras=True),
-    # The number behind the colon keeps OpenCV's "P1: !!opencv-matrix" and lists of YAML out.
+    # Two numbers behind the colon keep OpenCV's "P1: !!opencv-matrix", lists of YAML and the penalties P1 and
+    # P2 of a matcher's settings out.
     "kitti_projections": CalibrationFormat(
-        "KITTI (P0: ...)", r"^\s*P[0-3][ \t]*:[ \t]*[-+.\d]", stereo.read_kitti, uses_cameras=True),
+        "KITTI (P0: ...)", rf"^\s*P[0-3][ \t]*:[ \t]*{_NUMBER}[ \t]+[-+.\d]", stereo.read_kitti, uses_cameras=True),
     "robotcar": CalibrationFormat(
         "pair of Oxford RobotCar's models (fx fy cx cy, and a 4x4)",
         rf"\A(?:\s*{_ROW}){{4}}\s*0(?:\.0*)?[ \t]+-?0(?:\.0*)?[ \t]+-?0(?:\.0*)?[ \t]+1(?:\.0*)?\s*\Z",

@@ -421,6 +421,7 @@ def test_named_matrices_may_be_plain_yaml(reading, names):
     ("text", "cure"),
     [
         ("intrinsics:\n  camRect0:\n    camera_matrix: [1, 2, 3, 4]\n", "DSEC.*camRect"),
+        ("P1: 600  # penalty\nP2: 2400\ncamera_fps: 30\n", "no M1, M2, R, T"),
         ("camera.height=960\ncamera.A=[1085 0 640; 0 1085 480; 0 0 1]\nt=0.159\n", "rc_visard.*--baseline"),
     ],
 )
