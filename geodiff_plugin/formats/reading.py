@@ -47,7 +47,8 @@ CALIBRATION_FORMATS: dict[str, CalibrationFormat] = {
     # Two numbers behind the colon keep OpenCV's "P1: !!opencv-matrix", lists of YAML and the penalties P1 and
     # P2 of a matcher's settings out.
     "kitti_projections": CalibrationFormat(
-        "KITTI (P0: ...)", rf"^\s*P[0-3][ \t]*:[ \t]*{_NUMBER}[ \t]+[-+.\d]", stereo.read_kitti, uses_cameras=True),
+        "KITTI (P0: ...)", rf"^\s*P[0-3][ \t]*:[ \t]*{_NUMBER}[ \t]+[-+.\d]", stereo.read_kitti,
+        uses_cameras=True),
     "robotcar": CalibrationFormat(
         "pair of Oxford RobotCar's models (fx fy cx cy, and a 4x4)",
         rf"\A(?:\s*{_ROW}){{4}}\s*0(?:\.0*)?[ \t]+-?0(?:\.0*)?[ \t]+-?0(?:\.0*)?[ \t]+1(?:\.0*)?\s*\Z",
