@@ -63,7 +63,7 @@ FOREIGN_CALIBRATIONS = (
     ForeignCalibration(
         r'\A\s*\[(?=[\s\S]*"transform")(?=[\s\S]*"intrinsics")[\s\S]*"distortion_model"',
         "a rig of cuVSLAM (.edex)",
-        f"Rectify its images and give --fx --fy --cx --cy and --baseline. {OF_PAIR}",
+        OF_PAIR,
     ),
     ForeignCalibration(
         r'"CalibrationInformation"',

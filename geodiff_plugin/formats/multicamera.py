@@ -97,10 +97,8 @@ def read_mc_calib(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
         if kind not in MC_CALIB_LENSES:
             bad_value("distortion_type", f"one of {', '.join(map(str, MC_CALIB_LENSES))}", kind)
         K = array_of(without_sizes(entries["camera_matrix"]), (3, 3), f"camera_matrix of {name}")
-        size, lens = (
-            (entries["img_width"], entries["img_height"]),
-            without_sizes(entries["distortion_vector"]),
-        )
+        size = entries["img_width"], entries["img_height"]
+        lens = without_sizes(entries["distortion_vector"])
         cameras.append(Camera(K, size, lens, MC_CALIB_LENSES[kind]))
         poses.append(rigid(without_sizes(entries["camera_pose_matrix"]), f"camera_pose_matrix of {name}"))
     rig = make_rig(cameras[0], cameras[1], np.linalg.inv(poses[0]) @ poses[1])

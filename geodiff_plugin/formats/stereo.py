@@ -126,8 +126,9 @@ def read_spring(texts: tuple[str, ...], choice: CameraChoice) -> Rig:
     rows = array_of(texts[0].split(), (-1,), "fx fy cx cy").reshape(-1, 4)
     turn = rows[:3, :3]
     if len(rows) in (3, 4) and np.allclose(turn @ turn.T, np.eye(3), atol=ROTATION_TOLERANCE):
-        cure = "Give it as --E, and the matrix of the cameras as --K (--K-right): --E is the right camera's "
-        bad_value("the file", "a calibration", "a pose", f"{cure}pose in the left camera's frame.")
+        cure = "Give K of the cameras (--K, --K-right), and it as --E, if it is the right camera's pose in "
+        cure += "the left camera's frame."
+        bad_value("the file", "a calibration", "a pose", cure)
     left_image = str(choice.image_names[0]) if choice.image_names else ""
     if SPRING_NAME not in left_image and choice.baseline_m is None:
         named = zip(("fx", "fy", "cx", "cy"), rows[0], strict=True)

@@ -293,7 +293,7 @@ def test_sockets_of_an_oak_may_have_names(tmp_path):
         (b'{"extrinsics": [{"rotation": {"qw": 1.0}}], "intrinsics": [{"fx": 9}]}', "DGP"),
         (b"fu = 620.5\nfv = 622.1\ncu = 526\ncv = 374\nu_direction = 1 0 0\n", "Ames.*camera to the world"),
         (b"https://www.youtube.com/watch?v=a\n52553 " + b"0.5 " * 18 + b"\n", "RealEstate10K.*shares"),
-        (b"1 0 0 0.1\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "Give it as --E"),
+        (b"1 0 0 0.1\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "got a pose.*it as --E"),
         (b"fx: 700\nfy: 700\ncx: 320\ncy: 240\n", "--baseline"),
         (b"image_width: 9\ncamera_matrix: {data: [1]}\ndistortion_model: plumb_bob\n", "--calib twice"),
         (b'{"intrinsic_matrix": [1, 0, 0, 0, 1, 0, 5, 5, 1], "width": 9}', "Open3D"),
