@@ -36,8 +36,8 @@ def main(argv: list[str] | None = None) -> None:
     left, right = (ImageOps.exif_transpose(Image.open(path)) for path in (options.left, options.right))
 
     pipe = load_prior(options.prior)
-    enable_geometry_guidance(pipe)  # one
-    guidance = GeometryGuidance.from_calibration(right, options.calib)  # two
+    enable_geometry_guidance(pipe)  # first additional line
+    guidance = GeometryGuidance.from_calibration(right, options.calib)  # second
 
     out = pipe(
         left,
@@ -47,12 +47,11 @@ def main(argv: list[str] | None = None) -> None:
     )
 
     depth_m = out.prediction[0, ..., 0]
-    np.save(options.out.with_suffix(".npy"), depth_m)
-    depth_figure(depth_m).save(options.out.with_suffix(".png"))
+    array, picture = options.out.with_suffix(".npy"), options.out.with_suffix(".png")
+    np.save(array, depth_m)
+    depth_figure(depth_m).save(picture)
     print(f"{depth_m.min():.2f} m to {depth_m.max():.2f} m, median {np.median(depth_m):.2f} m")
-    print(
-        f"scale {out.scale.item():.3f}, shift {out.shift.item():.3f}, times {out.global_scale.item():.3f} m"
-    )
+    print(f"{out.verdict.status}, mean confidence {out.confidence.mean():.2f} -> {array}, {picture}")
     for sentence in out.warnings:
         print(f"warning: {sentence}")
 

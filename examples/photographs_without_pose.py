@@ -60,7 +60,7 @@ def main(argv: list[str] | None = None) -> None:
     print(f"{found.inliers[0]} inliers, parallax {found.parallax_deg[0]:.1f} degrees")
     depth_m = out.prediction[0, ..., 0]
     np.save(options.out, depth_m)
-    print(f"{depth_m.min():.2f} to {depth_m.max():.2f} {out.unit or 'baselines'}")
+    print(f"{depth_m.min():.2f} to {depth_m.max():.2f} {out.unit or 'baselines'} -> {options.out}")
     for sentence in out.warnings:
         print(f"warning: {sentence}")
 

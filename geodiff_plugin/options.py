@@ -185,7 +185,9 @@ class PriorOptions:
     """Which prior runs, and where: what every command that runs one has in common."""
 
     prior: str = _prior(
-        "bundled", "The prior: 'bundled', a hub id or a folder; KEY:FOLDER names the adapter of a folder."
+        "bundled",
+        "The prior: 'bundled', a hub id such as prs-eth/marigold-depth-v1-1, or a folder; KEY:FOLDER names "
+        "the adapter of a folder.",
     )
     space: str | None = _prior(
         None,

@@ -28,8 +28,12 @@ from geodiff_plugin.jobs.telling import Tell, collected_warnings, say, silent
 from geodiff_plugin.options import imported
 from geodiff_plugin.types import UNTESTED
 
+#: What to open first of a finished result.
+FIRST_FILES = ("overview.png", "depth.npy", "cloud.ply")
 #: A table of more pairs than this shows only failed and untrusted ones.
 MOST_ROWS = 20
+#: How a capture without a unit gets metres.
+TO_METRES = "for metres give --known-length, --distance or --metres-per-unit"
 #: Frames that are not trusted, of which the summary gives the names.
 MOST_NAMES = 9
 
@@ -50,7 +54,7 @@ def run_depth(options: DepthOptions, folder: OutFolder, started: float) -> None:
     if options.json:
         print(report_text(report))
     elif not options.quiet:
-        print(summary_line(report, f"{folder.path}/"))
+        print(summary_line(report, f"{folder.path}/: {', '.join(FIRST_FILES)}"))
 
 
 def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
@@ -108,7 +112,8 @@ def _show_rows(rows: Sequence[Row], out: Path) -> None:
     totals = f"{done} done, {there} there already, {len(failed)} failed, {doubted} not trusted"
     totals += f", {len(doubtful) - doubted} not judged" * (doubted < len(doubtful))
     messages = [Text(f"{row['pair']}: {row['message']}") for row in failed]
-    show(table, Text(f"{number}: {totals} -> {out}/"), *messages)
+    files = ", ".join(f"NAME/{file}" for file in FIRST_FILES)
+    show(table, Text(f"{number}: {totals} -> {out}/: {files}"), *messages)
 
 
 def run_capture(options: CaptureOptions) -> None:
@@ -123,7 +128,8 @@ def run_capture(options: CaptureOptions) -> None:
     elif options.poses_only:
         print(f"poses {report['poses']['status']} -> {options.out}/")
     else:
-        print(summary(report, options.out))
+        files = ": sheet.jpg, cloud.ply, NAME/depth.npy" if options.shard is None else ""
+        print(f"{summary(report, options.out)}{files}")
         for record in report.get("measured", ()):
             print(measured_words(record))
     if report["failed"] or (options.strict and report["not_trusted"]):
@@ -135,7 +141,7 @@ def summary(report: dict[str, Any], out: Path) -> str:
     depths = sorted(frame["depth"]["median"] for frame in report["frames"] if "error" not in frame)
     line = f"{len(depths)} of {len(report['frames'])} frames"
     if depths:
-        unit = "m" if report["unit"] else "units of the poses"
+        unit = "m" if report["unit"] else f"units of the poses ({TO_METRES})"
         line += f", median depth {depths[len(depths) // 2]:.2f} {unit}"
     if doubted := report["not_trusted"]:
         line += f"; NOT TRUSTED: {', '.join(doubted[:MOST_NAMES])}{' ...' if doubted[MOST_NAMES:] else ''}"

@@ -194,11 +194,12 @@ def _format_of(texts: dict[Path, str]) -> CalibrationFormat:
     entry = CALIBRATION_FORMATS[names.pop()]
     if len(texts) not in entry.file_counts:
         counts = " or ".join(map(str, entry.file_counts))
-        twice = "Give --calib twice, for the left and the right view."
+        files = "file" if entry.file_counts == (1,) else "files"
+        both = "Give both: --calib twice, for the left and the right view (in Python two paths)."
         once = "A file of both cameras is given once; of files of one camera each give K and E of the pair."
-        cure = twice if len(texts) == 1 else once
-        expected = f"as many files as {entry.summary} has: {counts}"
-        bad_value("calibration", expected, " and ".join(map(str, texts)), cure)
+        expected = f"{counts} {files} of this format, {entry.summary}"
+        got = f"{len(texts)}, {' and '.join(map(str, texts))}"
+        bad_value("calibration", expected, got, both if len(texts) == 1 else once)
     return entry
 
 

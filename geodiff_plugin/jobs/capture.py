@@ -409,11 +409,11 @@ def _depth_of_frames(
 
 
 def _tell_of_poses(capture: Capture, scale: KnownScale | None, tell: Tell) -> None:
-    """A line on how the poses fit, and warnings on them and on their scale."""
+    """Lines on how the poses fit, and warnings on what is wrong with them or with their scale."""
     solved = capture.solve()
     tell(f"poses {solved.status}: matches lie {solved.residual_px:.2f} px off their epipolar lines")
     for note in (*solved.notes, *([scale.doubt] if scale and scale.doubt else ())):
-        warn(note)
+        (tell if note.code == "capture.kept" else warn)(note)
 
 
 def _measured(

@@ -92,13 +92,15 @@ class DepthOptions(SpeedOptions, RunOptions):
     )
     right: Path | None = declare(
         None,
-        "Right image, folder or video. Leave it out with --points, or where one video shows both views side "
-        "by side.",
+        "Right image, folder or video. Leave it out with --points, or where one picture or video holds both "
+        "views.",
         "",
         metavar="RIGHT",
     )
     calib: tuple[Path, ...] = _camera(
-        (), "Calibration file or COLMAP folder; repeat it for one file per view."
+        (),
+        "Calibration file or COLMAP folder; repeat it for one file per view. The format (OpenCV, ROS, Kalibr, "
+        "ZED, KITTI and others) is recognised.",
     )
     cameras: str | None = _camera(None, "Two cameras of a calibration file that has more, left first: 2,3.")
     baseline: float | None = _camera(
@@ -140,10 +142,12 @@ class DepthOptions(SpeedOptions, RunOptions):
         (), "Lens distortion of each --view; 0,0,0,0 for none (default: that of LEFT)."
     )
     prior_map: Path | None = _prior(
-        None, "Take another model's depth map of LEFT, or a folder of maps, as the prior."
+        None,
+        "Take another model's depth map of LEFT, or a folder of maps, as the prior; --space says what its "
+        "values are.",
     )
     points: Path | None = _known(
-        None, "Known depths in metres: a depth map of LEFT, or points (.npy, text, .ply)."
+        None, "Known depths in metres: a depth map of LEFT, or points (.npy, text, .ply, .pcd, .las)."
     )
     points_scale: float | None = _known(
         None, "Units per metre of --points (1000: millimetres), or per pixel of --disparity.", above_0="units"
@@ -349,6 +353,7 @@ class DepthOptions(SpeedOptions, RunOptions):
             what = "K is" if self.estimate_pose else "The cameras are"
             refuse(f"{what} given in several ways, by {' and '.join(taken)}. Give one of: {known}.")
         if not taken and not self.estimate_pose:
+            known += "" if alone else ", or --estimate-pose --baseline METRES for photographs alone"
             refuse(f"The cameras are missing. Give {known}: there are no metres without them.")
         way = taken[0] if taken else "EXIF"
         missing = [_flag(name) for name in needed.get(way, ()) if getattr(self, name) is None]
