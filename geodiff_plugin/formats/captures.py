@@ -224,7 +224,8 @@ def _with_camera(
     elif frame.index is not None:
         bad_value("K", "given by --K or --fov", "none", "A video does not say its focal length.")
     else:
-        K = intrinsics_from_exif(frame.image, name, as_stored=as_stored)[0]
+        # The reason begins with the frame's name, and is the same for all frames.
+        K = intrinsics_from_exif(frame.image, "the image", as_stored=as_stored)[0]
     lens = None if camera is None else lens_of(camera, name)
     depth = frame.depth if frame.depth is not None and os.path.isfile(frame.depth) else None
     return replace(frame, size=size, K=np.asarray(K, float), lens=lens, depth=depth, as_stored=as_stored)

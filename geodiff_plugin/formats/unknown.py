@@ -22,6 +22,8 @@ MOST_FILES = 2000
 MOST_KINDS = 6
 #: Folders in it that are compared with the formats.
 MOST_FOLDERS = 20
+#: Where a model lies in the folder above that of its images, beside that folder itself.
+MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "sensors")
 #: Files of one mark whose beginnings are compared.
 MOST_LOOKED_AT = 5
 #: Bytes of a beginning.
@@ -217,7 +219,7 @@ def refuse_unknown(source: Path, formats: Sequence[CaptureFormat]) -> NoReturn:
 def poses_beside(folder: Path, formats: Sequence[CaptureFormat]) -> tuple[Message, ...]:
     """What to say of a folder whose images are read without poses, though it may hold some."""
     posed = [each for each in formats if each.has_poses]
-    hints = [_foreign(folder, only_poses=True), _inside(folder, posed)]
+    hints = [_foreign(folder, only_poses=True), _inside(folder, posed), _above(folder, posed)]
     said = " ".join(filter(None, hints))
     return (Message("capture.poses-beside", f"Images are read, without poses. {said}"),) if said else ()
 
@@ -263,6 +265,18 @@ def _inside(folder: Path, formats: Sequence[CaptureFormat]) -> str:
         for below in inside:
             if all(_has(below, mark) for mark in each.marks):
                 return f"{below.name}/ looks like {each.summary}: give that folder."
+    return ""
+
+
+def _above(folder: Path, formats: Sequence[CaptureFormat]) -> str:
+    """The folder above, if it looks like a capture whose file of cameras names images."""
+    above = folder.resolve().parent
+    for each in formats:
+        marks = [tuple(name.removeprefix("**/") for name in _patterns(mark)) for mark in each.marks]
+        if not each.names_images or marks[0][0].startswith("*"):  # any program writes a *.xml
+            continue
+        if any(all(_has(above / place, mark) for mark in marks) for place in MODEL_FOLDERS):
+            return f"The folder above, {above.name}/, looks like {each.summary}: give that folder."
     return ""
 
 

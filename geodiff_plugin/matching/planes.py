@@ -61,7 +61,8 @@ class Parallax:
         """
         if not self._far.size:
             expected, got = "a pose under which the views overlap", "a right camera that looks the other way"
-            bad_value(self._name, expected, got)
+            cure = "Check degrees against radians, the order of a quaternion (scipy: x, y, z, w) and the axes."
+            bad_value(self._name, expected, got, cure)
         z = self._far + inverse_depth * self._ahead
         in_front = z > NEAREST_M
         shift = np.where(in_front, inverse_depth * self._way / np.where(in_front, z, 1.0), np.inf)

@@ -49,7 +49,9 @@ def prior_of(pipe: Any) -> DepthPrior:
         if isinstance(pipe, getattr(adapter, "pipeline_class", ())):
             return adapter(pipe)  # type: ignore[call-arg]
     expected = f"a pipeline with an adapter ({', '.join(PRIORS)})"
-    bad_type("pipe", expected, pipe, "docs/how-to/extending.md shows how to write one.")
+    loaded = "Of a hub id or a folder: load_prior(name)."
+    written = "docs/how-to/extending.md shows how to write one."
+    bad_type("pipe", expected, pipe, loaded if isinstance(pipe, str) else written)
 
 
 @dataclass(frozen=True)

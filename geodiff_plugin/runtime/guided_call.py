@@ -245,7 +245,7 @@ def _check_named_arguments(pipeline: type) -> None:
 
 def _check_guided_call(guidance: Any, callback: Any) -> None:
     if not isinstance(guidance, GeometryGuidance):
-        bad_type("guidance", "a GeometryGuidance", guidance, "GeometryGuidance(right, K, E)")
+        bad_type("guidance", "a GeometryGuidance", guidance, "Make one: GeometryGuidance(right, K, E).")
     if callback is not None and not callable(callback):
         bad_type("callback_on_step_end", "a function", callback)
     if torch.is_inference_mode_enabled() and guidance.updates.inner_steps > 0:
@@ -327,7 +327,11 @@ def _one_member(call: dict[str, Any]) -> dict[str, Any]:
 
 
 class GuidedMarigoldDepthPipeline(GuidedCall, MarigoldDepthPipeline):
-    """``MarigoldDepthPipeline`` whose call takes ``guidance``; ``from_pretrained`` as always."""
+    """``MarigoldDepthPipeline`` whose call takes ``guidance``; ``from_pretrained`` as always.
+
+    >>> pipe = GuidedMarigoldDepthPipeline.from_pretrained("prs-eth/marigold-depth-v1-1")
+    >>> depth_m = pipe(left, guidance=GeometryGuidance(right, K, E)).prediction
+    """
 
 
 def _stock_class(guided: type) -> type:

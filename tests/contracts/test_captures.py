@@ -322,6 +322,28 @@ def test_poses_that_are_not_read_beside_images_are_said(tmp_path):
     assert not read_capture(folder, fov=60.0)[3]
 
 
+@pytest.mark.parametrize(
+    ("file", "said"), [("transforms.json", "a transforms.json"), ("sparse/0/cameras.txt", "a COLMAP model")]
+)
+def test_a_folder_of_images_inside_a_capture_is_told_of_the_folder_above(file, said, tmp_path):
+    images = splats(tmp_path / "scan").path.parent / "images"
+    assert not read_capture(images, fov=60.0)[3]
+    model = images.parent / file
+    model.parent.mkdir(parents=True, exist_ok=True)
+    model.write_text("")
+    model.with_name("images.txt").write_text("")
+    (note,) = read_capture(images, fov=60.0)[3]
+    assert note.code == "capture.poses-beside"
+    assert f"The folder above, {images.parent.name}/, looks like {said}: give that folder." in note
+
+
+def test_frames_without_a_focal_length_share_one_reason(tmp_path):
+    images = splats(tmp_path / "scan").path.parent / "images"
+    with pytest.raises(InputError, match="two frames; got 0") as refused:
+        read_capture(images)
+    assert str(refused.value).count("no focal length in its EXIF") == 1
+
+
 def test_a_file_that_was_written_before_its_images_were_placed_is_said(tmp_path):
     twin = openmvg(tmp_path / "scan")
     (twin.path / "sfm_data_final.json").unlink()
