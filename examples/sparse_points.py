@@ -56,7 +56,8 @@ def main(argv: list[str] | None = None) -> None:
 
     depth_m = out.prediction[0, ..., 0]
     np.save(options.out, depth_m)
-    print(f"{depth_m.min():.2f} m to {depth_m.max():.2f} m, median {np.median(depth_m):.2f} m -> {options.out}")
+    print(f"{depth_m.min():.2f} m to {depth_m.max():.2f} m, median {np.median(depth_m):.2f} m")
+    print(options.out)
     if truth_m is not None:
         withheld = pair.valid & (points == 0)
         error = np.abs(depth_m - truth_m)[withheld] / truth_m[withheld]

@@ -263,7 +263,7 @@ def split_views(views: Any, *, cropped: bool = False) -> SplitViews:
         bad_type("views", form, views)
     if len(views) < 2 or not all(isinstance(view, (list, tuple)) and len(view) == 3 for view in views):
         kinds = [len(v) if isinstance(v, (list, tuple)) else type(v).__name__ for v in views]
-        bad_value("views", form, f"{len(views)} entries of lengths {kinds}", "Give three values for each view.")
+        bad_value("views", form, f"{len(views)} entries of lengths {kinds}", "Give three values a view.")
     images, Ks, Es = (tuple(column) for column in zip(*views, strict=True))
     if images[0] is None:
         return SplitViews(None, images[1:], Ks, Es)

@@ -99,8 +99,8 @@ class DepthOptions(SpeedOptions, RunOptions):
     )
     calib: tuple[Path, ...] = _camera(
         (),
-        "Calibration file or COLMAP folder; repeat it for one file per view. The format (OpenCV, ROS, Kalibr, "
-        "ZED, KITTI and others) is recognised.",
+        "Calibration file or COLMAP folder; repeat it for one file per view. The format (OpenCV, ROS, "
+        "Kalibr, ZED, KITTI and others) is recognised.",
     )
     cameras: str | None = _camera(None, "Two cameras of a calibration file that has more, left first: 2,3.")
     baseline: float | None = _camera(

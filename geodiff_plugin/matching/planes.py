@@ -61,7 +61,7 @@ class Parallax:
         """
         if not self._far.size:
             expected, got = "a pose under which the views overlap", "a right camera that looks the other way"
-            cure = "Check degrees against radians, the order of a quaternion (scipy: x, y, z, w) and the axes."
+            cure = "Check radians and degrees, the order of a quaternion (scipy: x, y, z, w) and the axes."
             bad_value(self._name, expected, got, cure)
         z = self._far + inverse_depth * self._ahead
         in_front = z > NEAREST_M

@@ -115,16 +115,17 @@ with its cause and its cure.
 
 ![The depth of every row, in the colours of the truth](../images/mistaken.webp)
 
-*The depth of every row below, from left to right and down, in the colours of the truth: yellow is near, blue far or farther.*
+*The depth of every row below, from left to right and down, in the colours of the truth: yellow is near, blue
+is far.*
 
 | given | verdict | depth / truth | what was said |
 | --- | --- | ---: | --- |
 {rows}
 
 A baseline or a focal length that is wrong by a factor changes nothing in the pictures of a rectified rig, so
-they cannot show it; nor can they show a centre that is off, unless it puts things behind infinity. So these rows
-are trusted, and wrong. A length is named where it is implausible, as millimetres are; otherwise measure one known
-distance.
+they cannot show it; nor can they show a centre that is off, unless it puts things behind infinity. So these
+rows are trusted, and wrong. A length is named where it is implausible, as millimetres are; otherwise measure
+one known distance.
 """
 
 
