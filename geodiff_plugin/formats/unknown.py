@@ -206,14 +206,15 @@ def refuse_foreign(source: Path) -> None:
 def refuse_unknown(source: Path, formats: Sequence[CaptureFormat]) -> NoReturn:
     """Refuse a path that no reader recognises: what was looked for, what is there, and what comes nearest."""
     *others, last = (each.summary for each in formats)
-    expected = f"{', '.join(others)} or {last}"
+    expected, all_formats = "a capture that is read", f"It is none of these: {', '.join(others)} or {last}."
     if source.is_file():
         check_file(source, "PATH", expected)  # what failed downloads leave has a cure of its own
-        bad_value("PATH", expected, f"{source}, which is none of these")
+        bad_value("PATH", expected, source, all_formats)
     posed = [each for each in formats if each.has_poses]
-    hints = [_foreign(source), _inside(source, posed), _nearest(source, posed)]
+    hints = [_rig(source), _foreign(source), _inside(source, posed), _nearest(source, posed)]
     cure = " ".join(filter(None, hints)) or _inside(source, formats)
-    bad_value("PATH", expected, f"{source}, which is none of these: it holds {_content(source)}", cure)
+    got = f"{source}, which holds {_content(source)}"
+    bad_value("PATH", expected, got, f"{cure} {all_formats}".strip())
 
 
 def poses_beside(folder: Path, formats: Sequence[CaptureFormat]) -> tuple[Message, ...]:
@@ -256,6 +257,15 @@ def _foreign(folder: Path, only_poses: bool = False) -> str:
 
 def _is_like(path: Path, content: str) -> bool:
     return path.is_file() and os.access(path, os.R_OK) and _has_content(path, content)
+
+
+def _rig(folder: Path) -> str:
+    """What to do with a folder that holds one of left and one of right images."""
+    names = [path.name for path in islice(folder.iterdir(), MOST_FILES) if path.is_dir()]
+    sides = [next((n for n in names if n.lower().startswith(side)), None) for side in ("left", "right")]
+    if None in sides:
+        return ""
+    return f"Pairs of a stereo rig are for geodiff depth: give it {sides[0]}/ and {sides[1]}/, with --calib."
 
 
 def _inside(folder: Path, formats: Sequence[CaptureFormat]) -> str:

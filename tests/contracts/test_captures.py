@@ -24,6 +24,7 @@ from tests.contracts.captures import (
     metashape,
     nvm,
     opensfm,
+    pictures,
     replica,
     scanner_app,
     stray,
@@ -193,7 +194,7 @@ def test_a_folder_that_nothing_recognises_is_described_and_the_nearest_named(lef
     }
     for name in there[left_out]:
         (tmp_path / name).mkdir() if name.endswith("/") else (tmp_path / name).write_text("x")
-    with pytest.raises(InputError, match=f"(?s)a transforms.json, a COLMAP model, .*it holds .*{said}"):
+    with pytest.raises(InputError, match=f"(?s)which holds .*{said}.* a transforms.json, a COLMAP model, "):
         read_capture(tmp_path)
     shutil.move(tmp_path / there[left_out][0], tmp_path / "other")
 
@@ -335,6 +336,13 @@ def test_a_folder_of_images_inside_a_capture_is_told_of_the_folder_above(file, s
     (note,) = read_capture(images, fov=60.0)[3]
     assert note.code == "capture.poses-beside"
     assert f"The folder above, {images.parent.name}/, looks like {said}: give that folder." in note
+
+
+def test_folders_of_a_rig_are_sent_to_the_command_for_pairs(tmp_path):
+    for side in ("Left", "right"):
+        pictures(tmp_path / side, [f"{i}.png" for i in range(4)])
+    with pytest.raises(InputError, match="rig are for geodiff depth: give it Left/ and right/, with --calib"):
+        read_capture(tmp_path)
 
 
 def test_frames_without_a_focal_length_share_one_reason(tmp_path):
