@@ -33,7 +33,7 @@ class Room:
 
 ROOMS = (
     Room("cycles", "a hallway", "scooter", ((232, 192), (232, 318))),
-    Room("toy", "a play mat", "toy bench", ((278, 300), (410, 300))),
+    Room("toy", "a play mat", "toy bench", ((286, 288), (414, 288))),
     Room("desk", "a desk", "drawers", ((250, 346), (329, 336))),
     Room("corridor", "a landing", "door", ((228, 260), (318, 260))),
     Room("living_room", "a living room", "table", ((270, 330), (420, 330))),
