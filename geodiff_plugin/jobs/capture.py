@@ -336,10 +336,10 @@ def depth_capture(options: CaptureOptions, *, tell: Tell = silent, progress: boo
     started = time.perf_counter()
     capture = open_capture(options)
     names = capture.choose(options.frames)
-    for note in capture.notes:
-        tell(note)
     ours = any((options.out / name).is_file() for name in (POSES_FILE, JOURNAL, RECORD))
     check_new(options.out, ours or options.overwrite).mkdir(parents=True, exist_ok=True)
+    for note in capture.notes:
+        tell(note)
     largest = max((capture.frame(name).size for name in names), key=math.prod)
     with (
         working_in(options.out, shared=not Shard.of(options.shard).whole),
