@@ -32,8 +32,8 @@ from geodiff_plugin.types import UNTESTED
 FIRST_FILES = ("overview.png", "depth.npy", "cloud.ply")
 #: A table of more pairs than this shows only failed and untrusted ones.
 MOST_ROWS = 20
-#: How a capture without a unit gets metres.
-TO_METRES = "for metres give --known-length, --distance or --metres-per-unit"
+#: How a capture without a unit gets one.
+GIVE_LENGTH = "a length gives the unit: --known-length or --distance"
 #: Frames that are not trusted, of which the summary gives the names.
 MOST_NAMES = 9
 
@@ -141,7 +141,7 @@ def summary(report: dict[str, Any], out: Path) -> str:
     depths = sorted(frame["depth"]["median"] for frame in report["frames"] if "error" not in frame)
     line = f"{len(depths)} of {len(report['frames'])} frames"
     if depths:
-        unit = "m" if report["unit"] else f"units of the poses ({TO_METRES})"
+        unit = "m" if report["unit"] else f"units of the poses ({GIVE_LENGTH})"
         line += f", median depth {depths[len(depths) // 2]:.2f} {unit}"
     if doubted := report["not_trusted"]:
         line += f"; NOT TRUSTED: {', '.join(doubted[:MOST_NAMES])}{' ...' if doubted[MOST_NAMES:] else ''}"
