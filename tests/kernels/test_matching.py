@@ -19,6 +19,15 @@ SIZES = st.tuples(*(st.integers(1, most) for most in (37, 9, 11)))
 FOUR, EIGHT = [(1, 0), (0, 1)], [(1, 0), (0, 1), (1, 1), (1, -1)]
 
 
+@pytest.fixture(autouse=True)
+def large_blocks(device, monkeypatch):
+    """The interpreter runs one block after the other, and takes hardly longer for a larger one."""
+    from geodiff_plugin.matching import kernels
+
+    if device.type == "cpu":
+        monkeypatch.setattr(kernels, "COST_BLOCK", (128, 16))
+
+
 def random_volume(size: tuple[int, int, int], seed: int, device: torch.device):
     """Costs, where they are seen, and a grey image."""
     generator = torch.Generator().manual_seed(seed)
