@@ -42,11 +42,15 @@ class Inputs:
     unit: str | None = "m"
     shared_intrinsics: bool = False  # one K was given for all views, so their images must have one size
 
+    def with_left(self, left_01: Tensor) -> PosedViews:
+        """The left image, on any device, with its right views as they were read, on the CPU."""
+        return PosedViews(left_01, self.views, torch.from_numpy(self.K_left).float())
+
     def beside(self, left_01: Tensor) -> PosedViews:
         """The left image with its right views on its device, and their cameras on the CPU; all float32."""
         device = left_01.device
         views = tuple(view._replace(image_01=view.image_01.to(device, torch.float32)) for view in self.views)
-        return PosedViews(left_01, views, torch.from_numpy(self.K_left).float())
+        return self.with_left(left_01)._replace(views=views)
 
     def points_on(self, device: torch.device) -> Tensor | None:
         """The known depths, float32 on a device."""

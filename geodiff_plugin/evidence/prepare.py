@@ -58,35 +58,40 @@ def make_evidence(
 
     ``measured_baseline``: a refined pose keeps the distance between the cameras.
     """
+    checks = bool(given.views) and config.pose != "given"
+    if checks and leaves_cpu_free(left_01.device):
+        return _made_beside_check(left_01, given, config, measured_baseline)
     posed, points = given.beside(left_01), given.points_on(left_01.device)
     if not posed.views:
         return prepare_evidence(posed, points, config)
-    if config.pose == "given":
-        posed = _with_clean_images(posed, config)
-        report = Beside.known(report_as_given(posed.views))
-        return replace(prepare_evidence(posed, points, config), report=report)
-    if leaves_cpu_free(left_01.device):
-        return _made_beside_check(posed, points, config, measured_baseline)
     posed = _with_clean_images(posed, config)
-    views, found = refine_views(posed, measure_fit(posed_greys(posed)), measured_baseline)
-    made = prepare_evidence(posed._replace(views=views), points, config)
-    return replace(made, report=Beside.known(found))
+    if not checks:
+        report = report_as_given(posed.views)
+    else:
+        views, report = refine_views(posed, measure_fit(posed_greys(posed)), measured_baseline)
+        posed = posed._replace(views=views)
+    return replace(prepare_evidence(posed, points, config), report=Beside.known(report))
 
 
 def _made_beside_check(
-    posed: PosedViews, points: Tensor | None, config: GuidanceConfig, measured_baseline: bool
+    left_01: Tensor, given: Inputs, config: GuidanceConfig, measured_baseline: bool
 ) -> Evidence:
     """The same, where the device matches the views while the CPU matches their features.
 
-    As most poses fit, the views are matched as given. Small pictures mostly show that they fit; what else
-    there is to find then changes no view, and act 3 is the first to ask.
+    That begins before it is known whether the photographs are clean, and again if they were not. As most
+    poses fit, the views are matched as given. Small pictures mostly show that they fit; what else there is to
+    find then changes no view, and act 3 is the first to ask.
     """
-    (clear, check), evidence = _checked_beside(posed, config), None
+    check, evidence = _check_beside(given.with_left(left_01)), None
+    posed, points = given.beside(left_01), given.points_on(left_01.device)
+    clear = _with_clean_images(posed, config)
+    if clear is not posed:
+        check = _check_beside(clear)
     with suppress(InputError):  # raised again below, unless a refined pose mends it
         evidence = prepare_evidence(clear, points, config)
     views = clear.views
     if check.surely.result() or check.fit.result().fits:
-        report = Beside(lambda: refine_views(clear, check.fit.result()).report, clear.left_01.device)
+        report = Beside(lambda: refine_views(clear, check.fit.result()).report, left_01.device)
     else:
         views, found = refine_views(clear, check.fit.result(), measured_baseline)
         report = Beside.known(found)
@@ -103,20 +108,11 @@ class _Check(NamedTuple):
 
 
 def _check_beside(posed: PosedViews) -> _Check:
+    """The check of views of which the left one, at least, is on the device."""
     device = posed.left_01.device
     greys = Beside(lambda: posed_greys(posed), device)
     surely = Beside(lambda: surely_fits(greys.result()), device)
     return _Check(surely, Beside(lambda: measure_fit(greys.result(), surely.result), device))
-
-
-def _checked_beside(posed: PosedViews, config: GuidanceConfig) -> tuple[PosedViews, _Check]:
-    """The views with clean photographs, and whether their poses fit.
-
-    Features are matched before it is known whether there are flaws, and again if there were.
-    """
-    early = _check_beside(posed)
-    clear = _with_clean_images(posed, config)
-    return (clear, early) if clear is posed else (clear, _check_beside(clear))
 
 
 def prepare_evidence(native: PosedViews, points: Tensor | None, config: GuidanceConfig) -> Evidence:

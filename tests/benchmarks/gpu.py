@@ -54,6 +54,7 @@ BUDGET_S, GRACE_S = 210, 60
 STAGES = (
     "GeometryGuidance.evidence_of",
     "  clean",
+    "  surely_fits",
     "  measure_fit",
     "  refine_views",
     "  build_cost_volume",
