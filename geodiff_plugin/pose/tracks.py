@@ -359,14 +359,15 @@ def match_features(left: tuple[np.ndarray, np.ndarray], right: tuple[np.ndarray,
 
 
 @functools.cache
-def _feature_threads(process: int) -> ThreadPoolExecutor:
+def _feature_threads(process: int, scale: float) -> ThreadPoolExecutor:
     """Threads of a process for SIFT, which spends most of its time outside of Python's lock.
 
+    Pictures of another scale have others: small ones, which take less time, do not wait for whole ones.
     They stay for the next pictures: a thread takes long to start while others have the lock, and the memory
     for the scales of a picture, some 100 MB, would come from the system and go back to it each time.
     """
     threads = min(available_cores(), _MOST_THREADS)
-    return ThreadPoolExecutor(threads, thread_name_prefix="geodiff-features")
+    return ThreadPoolExecutor(threads, thread_name_prefix=f"geodiff-features-{scale:g}")
 
 
 def sparse_tracks(views: Sequence[GreyImage], scale: float = 1.0) -> Tracks:
@@ -376,7 +377,7 @@ def sparse_tracks(views: Sequence[GreyImage], scale: float = 1.0) -> Tracks:
     """
     (_, K), *rights = views
     greys = [_shrunk(grey, scale) for grey, _ in views]
-    found = _feature_threads(os.getpid()).map(sift_features, greys)
+    found = _feature_threads(os.getpid(), scale).map(sift_features, greys)
     left, *of_rights = (
         (_enlarged(points[:, :2], small, grey), descriptors)
         for (points, descriptors), small, (grey, _) in zip(found, greys, views, strict=True)

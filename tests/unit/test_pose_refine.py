@@ -382,13 +382,16 @@ def test_the_threads_for_features_stay_for_the_next_pictures() -> None:
     rng = np.random.default_rng(0)
     views = [(rng.integers(0, 256, (60, 80), dtype=np.uint8), np.eye(3)) for _ in range(2)]
 
-    def threads() -> set[threading.Thread]:
-        return {each for each in threading.enumerate() if each.name.startswith("geodiff-features")}
+    def threads(scale: float) -> set[threading.Thread]:
+        return {
+            each for each in threading.enumerate() if each.name.startswith(f"geodiff-features-{scale:g}_")
+        }
 
-    sparse_tracks(views)
-    before = threads()
-    sparse_tracks(views)
-    assert before and before <= threads() and len(threads()) <= 4
+    for scale in (1.0, 0.5):  # small pictures wait for no whole ones
+        sparse_tracks(views, scale)
+        before = threads(scale)
+        sparse_tracks(views, scale)
+        assert before and before <= threads(scale) and len(threads(scale)) <= 4
 
 
 @pytest.mark.parametrize("E", [RIG, TRUE], ids=["rig", "posed"])
