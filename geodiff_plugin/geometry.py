@@ -7,6 +7,7 @@ comment says why it is not used.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -37,6 +38,11 @@ HIDDEN_MARGIN = 0.05
 def image_size(image: Tensor) -> tuple[int, int]:
     """``(H, W)`` of an image or a map ``(..., H, W)``."""
     return image.shape[-2], image.shape[-1]
+
+
+def stacked(parts: Sequence[Tensor]) -> Tensor:
+    """Tensors along a new first axis; a single one is copied only if it is not contiguous."""
+    return parts[0].contiguous()[None] if len(parts) == 1 else torch.stack(list(parts))
 
 
 def resize_intrinsics(K: Tensor, size_from: tuple[int, int], size_to: tuple[int, int]) -> Tensor:

@@ -20,7 +20,7 @@ from geodiff_plugin.algorithm.member import Member
 from geodiff_plugin.algorithm.terms import Given, Loss, Objective
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.geometry import resize_image
+from geodiff_plugin.geometry import resize_image, stacked
 from geodiff_plugin.matching import Matches, reject_reflections
 from geodiff_plugin.scale.points import order_agreement
 from geodiff_plugin.scale.space import AffineState, DepthRange, MetricMap, PriorMaps, joined
@@ -45,9 +45,9 @@ def chunk_views(evidence: Sequence[Evidence]) -> PosedViews:
         views = [grid.views[v if v < len(grid.views) else 0] for grid in grids]
         height, width = (max(view.image_01.shape[axis] for view in views) for axis in (-2, -1))
         sized = [resize_image(image, K, (height, width)) for image, K, _ in views]
-        images, Ks = (torch.stack(each) for each in zip(*sized, strict=True))
-        further.append(CameraView(images, Ks, torch.stack([view.T_right_from_left for view in views])))
-    left_01, K_left = (torch.stack([getattr(g, name) for g in grids]) for name in ("left_01", "K_left"))
+        images, Ks = (stacked(each) for each in zip(*sized, strict=True))
+        further.append(CameraView(images, Ks, stacked([view.T_right_from_left for view in views])))
+    left_01, K_left = (stacked([getattr(g, name) for g in grids]) for name in ("left_01", "K_left"))
     return PosedViews(left_01, tuple(further), K_left)
 
 

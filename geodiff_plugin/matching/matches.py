@@ -12,7 +12,7 @@ from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin._kernels import launch_bound
-from geodiff_plugin.geometry import NEAREST_M, project
+from geodiff_plugin.geometry import NEAREST_M, project, stacked
 
 #: The unit in which errors at points are measured, as a share of their median inverse depth.
 UNIT = 0.01
@@ -62,10 +62,10 @@ class Matches:
         if len(given) < len(images):
             return None
         names = ("inverse_depth", "confidence", "plane_step")
-        inverse_depth, confidence, step = (torch.stack([getattr(m, name) for m in given]) for name in names)
+        inverse_depth, confidence, step = (stacked([getattr(m, name) for m in given]) for name in names)
         deviations = [matches.deviation for matches in given]
         known = [each for each in deviations if each is not None]
-        deviation = torch.stack(known) if len(known) == len(given) else None
+        deviation = stacked(known) if len(known) == len(given) else None
         return cls(inverse_depth, confidence, step, deviation)
 
     @property

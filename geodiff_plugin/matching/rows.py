@@ -188,25 +188,31 @@ def match_rows(pictures: RowPictures, nearest_px: float) -> RowMatches:
     return RowMatches(shift_on, matched, hidden_on, filled_on, baseline_m, checks)
 
 
-def with_hidden(matches: Matches, rows: RowMatches, focal_px: float) -> Matches:
-    """Matches with the depth of the farther surface in the strips that the right view cannot see.
+class HiddenStrips(NamedTuple):
+    """The strips of an image that the right view cannot see, ``(1, 1, h, w)`` each."""
+
+    inside: Tensor  # bool
+    inverse_depth: Tensor  # 1/m of the farther surface, which goes on in them
+
+
+def hidden_strips(rows: RowMatches, size: tuple[int, int], focal_px: float) -> HiddenStrips:
+    """The strips on a grid of ``size``; ``focal_px`` is the focal length on the grid of ``rows``."""
+    layers = torch.stack([rows.shift, rows.hidden])[None]
+    shift, hidden = F.interpolate(layers, size, mode="nearest-exact").split(1, 1)
+    return HiddenStrips((hidden > 0) & (shift > 0), shift / (focal_px * rows.baseline_m))
+
+
+def with_hidden(matches: Matches, strips: HiddenStrips) -> Matches:
+    """Matches ``(1, 1, h, w)`` with the depth of the farther surface in the strips, on their grid.
 
     Nothing is matched there, and a fit would carry the nearer surface on until the image has an edge. They
     count as much as the matches around them know (``known_share``).
-
-    Args:
-        matches: ``(1, 1, h, w)``, on any grid.
-        rows: of the same images.
-        focal_px: focal length along the rows, pixels of the grid of ``rows``.
     """
-    layers = torch.stack([rows.shift, rows.hidden])[None]
-    shift, hidden = F.interpolate(layers, matches.size, mode="nearest-exact").split(1, 1)
-    put = (hidden > 0) & (shift > 0) & (matches.confidence < LEAST_KEPT)
-    inverse_depth = shift / (focal_px * rows.baseline_m)
+    put = strips.inside & (matches.confidence < LEAST_KEPT)
     confidence = HIDDEN_CONFIDENCE * known_share(matches)
     return replace(
         matches,
-        inverse_depth=torch.where(put, inverse_depth, matches.inverse_depth),
+        inverse_depth=torch.where(put, strips.inverse_depth, matches.inverse_depth),
         confidence=torch.where(put, confidence, matches.confidence),
         deviation=None if matches.deviation is None else torch.where(put, 1.0, matches.deviation),
     )

@@ -21,7 +21,7 @@ from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.geometry import image_size, resize_intrinsics
 from geodiff_plugin.matching import Matches, build_cost_volume, known_share, match_volume
-from geodiff_plugin.matching.rows import with_hidden
+from geodiff_plugin.matching.rows import HiddenStrips, hidden_strips, with_hidden
 from geodiff_plugin.messages import Message
 from geodiff_plugin.result.confidence import (
     Grounds,
@@ -215,15 +215,16 @@ def refine(
     target = correction_target(matches, points, weight, error, depth_m)
     if target is None or error is None:
         return None
-    if matches is not None:
-        target = _with_hidden(target, evidence)
+    strips = None if matches is None else _hidden_strips(evidence, target.size)
+    if strips is not None:
+        target = with_hidden(target, strips)
     fit = fit_depth(depth_m, target, evidence.native.left_01[None], error, config)
     fitted_m, support = fit.depth_m, fit.support
     if matches is not None:
         measured = error.amin((2, 3), keepdim=True)  # its value where the prior gives a depth
         target = correction_target(matches, points, weight, error, fitted_m)
         assert target is not None  # there are matches
-        completed = _with_hidden(target, evidence)
+        completed = target if strips is None else with_hidden(target, strips)
         known = known_share(completed)
         fitted_m = vote_depth(fitted_m, evidence, completed, known, measured, spacing)
         fitted_m = flatten(fitted_m, completed, left_01, measured, denoised_m)
@@ -231,14 +232,13 @@ def refine(
     return Refined(fitted_m, support, grounds_of(denoised_m, fitted_m, target, fit.support))
 
 
-def _with_hidden(target: Matches, evidence: Evidence) -> Matches:
-    """Matches, and what lies behind nearer surfaces where rows of the image were matched."""
-    rows = None if evidence.rows is None else evidence.rows.result()
-    if rows is None:
-        return target
-    native = evidence.native
+def _hidden_strips(evidence: Evidence, size: tuple[int, int]) -> HiddenStrips | None:
+    """What lies behind nearer surfaces, on a grid; ``None`` where no rows of the image were matched."""
+    if evidence.rows is None:
+        return None
+    rows, native = evidence.rows.result(), evidence.native
     focal_px = float(native.K_left[0, 0]) * rows.shift.shape[1] / native.size[1]
-    return with_hidden(target, rows, focal_px)
+    return hidden_strips(rows, size, focal_px)
 
 
 def _member_at(size: tuple[int, int], member: Member, like: Tensor, options: ResultOptions) -> Tensor:

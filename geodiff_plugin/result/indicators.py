@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -62,7 +62,7 @@ def measure_indicators(evidence: Evidence, depth_m: Tensor, range_given: bool) -
     if same_size:
         differences = [_largest_difference(view.image_01, left_01) for view in same_size]
         darkest, brightest = left_01.aminmax()
-        numbers |= {"difference": torch.stack(differences).amin(), "contrast": brightest - darkest}
+        numbers |= {"difference": _joined(torch.amin, differences), "contrast": brightest - darkest}
     matches, points, volume = evidence.matches, evidence.points, evidence.volume
     if matches is not None:
         planes = volume.inverse_depth if range_given and volume is not None else None
@@ -78,7 +78,12 @@ def measure_indicators(evidence: Evidence, depth_m: Tensor, range_given: bool) -
 def _largest_difference(image_01: Tensor, left_01: Tensor) -> Tensor:
     """The largest difference ``()`` of two images of one size, strip by strip to spare memory."""
     strips = row_strips(*image_size(left_01))
-    return torch.stack([(image_01[:, rows] - left_01[:, rows]).abs().amax() for rows in strips]).amax()
+    return _joined(torch.amax, [(image_01[:, rows] - left_01[:, rows]).abs().amax() for rows in strips])
+
+
+def _joined(reduced: Callable[[Tensor], Tensor], numbers: Sequence[Tensor]) -> Tensor:
+    """Numbers ``()`` reduced to one; a single one as it is, without a launch."""
+    return numbers[0] if len(numbers) == 1 else reduced(torch.stack(list(numbers)))
 
 
 def _where(values: Tensor, at: Tensor) -> Tensor:

@@ -22,7 +22,13 @@ from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.prepare import rows_beside
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import Matches, known_share, rows
-from geodiff_plugin.matching.rows import match_rows, rectified_pictures, row_pictures, with_hidden
+from geodiff_plugin.matching.rows import (
+    hidden_strips,
+    match_rows,
+    rectified_pictures,
+    row_pictures,
+    with_hidden,
+)
 from geodiff_plugin.result import voting
 from geodiff_plugin.result.misfit import MATCH_NOISE_PX, expected_error
 from geodiff_plugin.result.voting import vote_depth
@@ -369,7 +375,7 @@ def test_the_strip_beside_a_near_surface_gets_the_depth_behind_it(side):
     assert (rows.hidden > 0).any() and not (rows.hidden * (rows.matched + rows.filled)).any()
     sure = (rows.matched * (18.0 / truth[0, 0] - rows.shift).abs().lt(0.5)).view_as(truth)
     matches = Matches(1.0 / truth, 0.9 * sure, torch.tensor([2e-3]))
-    found = with_hidden(matches, rows, float(CAMERA[0, 0]))
+    found = with_hidden(matches, hidden_strips(rows, matches.size, float(CAMERA[0, 0])))
     put = found.confidence != matches.confidence
     assert put.any() and bool((put == ((rows.hidden > 0) & (sure == 0))).all())
     right = (found.inverse_depth * truth - 1.0).abs()[put] < 0.1
