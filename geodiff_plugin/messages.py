@@ -294,6 +294,18 @@ MESSAGES: dict[str, MessageKind] = {
         cure="Give a more exact pose, or views from further apart.",
         forbids_trust=True,
     ),
+    "pose.few-matches": MessageKind(
+        "The pose was refined, or kept, where hardly any features match",
+        cause="The pose misses what optical flow finds, and there are too few features to say by how much.",
+        cure="Give a more exact pose, or views that show more texture or overlap more.",
+        forbids_trust=True,
+    ),
+    "pose.unchecked": MessageKind(
+        "Nothing shows whether the pose is right",
+        cause="There are too few matches to check it, and the depth does not confirm it either.",
+        cure="Give views that show more texture or overlap more; or pose='given' for a pose that is exact.",
+        forbids_trust=True,
+    ),
     "pose.residual": MessageKind(
         "Matches lie 2 to 4 px off their epipolar lines",
         cause="The images are not quite rectified, the lens is not corrected, or the pose is inexact.",

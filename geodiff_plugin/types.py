@@ -80,8 +80,8 @@ class PoseReport:
 
     ``status`` is ``"given"`` (not checked, by configuration), ``"fits"``, ``"refined"``, ``"kept"`` (no
     better pose nearby), ``"mistaken"`` (a usual mistake explains the misfit; the pose is used as given) or
-    ``"not checked"``. Residuals are in pixels of the right images, resized to the left image's pixels per
-    radian; the left image is at most 832 on its longer side.
+    ``"not checked"`` (too few matches). Residuals are in pixels of the right images, resized to the left
+    image's pixels per radian; the left image is at most 832 on its longer side.
     """
 
     status: str
@@ -91,7 +91,7 @@ class PoseReport:
     residual_px: tuple[float, ...] = ()  # the same with the poses, and images, as used
     matches: tuple[float, ...] = ()  # number of matches of each right view
     straightened_px: tuple[float, ...] = ()  # root mean square displacement of the right images; 0 for none
-    scale_spread: float | None = None  # relative, of the scale of refined poses; None for measured baselines
+    scale_spread: float | None = None  # relative, of the scale of the poses as used; None for measured ones
     depth_spread: float = 0.0  # median change of log depth by another pose that fits as well
     behind_infinity: float = math.nan  # share of the matches at which the rays of the poses as used diverge
     behind_px: float = math.nan  # how far behind infinity the farthest of them lie; 0 where hardly any do
@@ -174,7 +174,7 @@ class Indicators:
     prior_ratio: float = math.nan  # median of the depth over a metric prior's depth
     epipolar_px: float = math.nan  # median distance of matches from their epipolar lines, the worst view's
     given_px: float = math.nan  # the same distance under the poses as given
-    scale_spread: float = math.nan  # relative standard deviation of a refined pose's scale, if in metres
+    scale_spread: float = math.nan  # relative standard deviation of the scale of the poses, if in metres
     depth_spread: float = math.nan  # median change of log depth by another pose that fits as well
     straightened_px: float = math.nan  # root mean square that no pose explains, the worst view's
     behind_infinity: float = math.nan  # share of the matches at which the two cameras' rays diverge
@@ -189,6 +189,7 @@ class Indicators:
     shear: float = math.nan  # of the right picture from its first row to its last, in shares of its width
     off_matches: float = math.nan  # median of the absolute log of the depth over the matched depth
     doubts: tuple[Message, ...] = ()  # warnings about the input, each of which forbids trust
+    pose_unchecked: bool = False  # too few matches show whether the poses are right
     mistakes: tuple[Message, ...] = ()  # of a given pose, that would explain its misfit (``pose.mistakes``)
     flat: bool = False  # all confident matches lie within two planes, and near enough to mean something
     same: bool = False  # the left and a right view are the same picture

@@ -91,7 +91,8 @@ def _made_beside_check(
         evidence = prepare_evidence(clear, points, config)
     views = clear.views
     if check.surely.result() or check.fit.result().fits:
-        report = Beside(lambda: refine_views(clear, check.fit.result()).report, left_01.device)
+        fit = check.fit
+        report = Beside(lambda: refine_views(clear, fit.result(), measured_baseline).report, left_01.device)
     else:
         views, found = refine_views(clear, check.fit.result(), measured_baseline)
         report = Beside.known(found)

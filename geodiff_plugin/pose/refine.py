@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from geodiff_plugin._checks import InputError
 from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.pose.bars import bar_share
 from geodiff_plugin.pose.lens import remaining_distortion
@@ -61,7 +63,8 @@ _MOST_SHIFT = 0.8
 #: Relative standard deviation, under the poses of a tracker, of the distance between two cameras; measured on
 #: 85 pairs of two trackers.
 LENGTH_SPREAD = 0.15
-#: The same of the scene's median depth, measured on the same pairs.
+#: The same of the scene's median depth, measured on the same pairs. A pose that is used as it was given has
+#: this uncertainty of its scale unless its length was measured: a pair does not show lengths.
 DEPTH_SPREAD = 0.05
 #: A pose is undetermined if the one that fits best changes log depth by more than this in the median. That
 #: was up to .148 for right pairs, and .17 to .64 where the yaw of E was off by a degree.
@@ -150,8 +153,8 @@ class PoseFit:
 
     @property
     def fits(self) -> bool:
-        """Whether no view misses by more: then ``refine_views`` leaves all views as they are."""
-        return self.surely or not (self.residual_px > self.limit_px).any()
+        """Whether enough matches show that no view misses by more: such views stay as they are."""
+        return self.surely or (self.is_known and not (self.residual_px > self.limit_px).any())
 
 
 def _fit_at(greys: PosedGreys, scale: float) -> PoseFit:
@@ -187,14 +190,14 @@ def refine_views(posed: PosedViews, fit: PoseFit, measured: bool = False) -> Che
     ``measured`` baselines keep their lengths, as those of a rectified rig do; others are weighed against the
     depth of the scene. The given views are returned if they fit, if there are too few matches, if a mistake
     explains the misfit, or if no better pose is near. A rectified rig is refined only if the dense matches
-    miss it as well.
+    miss it as well. Where few features match, optical flow is asked.
     """
+    if not (fit.is_known or fit.surely):
+        return _checked_by_flow(posed, fit, measured)
     rights, sparse, given, before = posed.views, fit.tracks, fit.greys.given, fit.residual_px
-    if not fit.is_known:
-        return CheckedViews(rights, report_as_given(rights, "not checked"))
     near = given if fit.fits else nearby_poses(sparse, given, before)
     greys = [grey for grey, _ in fit.greys.views]
-    report = _with_residuals(report_as_given(rights, "fits"), sparse, before)
+    report = _with_residuals(_as_given(posed, fit, measured), sparse, before)
     report = _with_pictures(report, posed, greys)
     report = _with_contradictions(report, sparse, given)
     report = replace(report, exchangeable=exchangeable(sparse, given, near, [grey.shape for grey in greys]))
@@ -217,6 +220,37 @@ def _with_residuals(report: PoseReport, tracks: Tracks, residual_px: np.ndarray)
     """The report with the residuals ``(V,)`` of these tracks under the given poses, which are in use."""
     residuals, matches = tuple(residual_px.tolist()), tuple(map(float, tracks.seen.sum(1)))
     return replace(report, residual_px_given=residuals, residual_px=residuals, matches=matches)
+
+
+def _as_given(posed: PosedViews, fit: PoseFit, measured: bool) -> PoseReport:
+    """The report of poses in use as they were given: a pair does not show lengths that nobody measured."""
+    spread = None if fit.rig or measured else DEPTH_SPREAD
+    return replace(report_as_given(posed.views, "fits"), scale_spread=spread)
+
+
+def _checked_by_flow(posed: PosedViews, fit: PoseFit, measured: bool) -> CheckedViews:
+    """The views whose features hardly match, with poses checked, and refined, by optical flow as well.
+
+    Flow starts from what the poses predict, and stays there on blank walls. So a pose that it does not fit is
+    wrong, but one that is refined by it is not certain. A calibration is not changed for that little.
+    """
+    rights, given, sparse = posed.views, fit.greys.given, fit.tracks
+    left, *greys = [grey for grey, _ in fit.greys.views]
+    tracks = sparse
+    with suppress(InputError):  # views without overlap, which matching is the one to refuse
+        depth_m = coarse_depth(posed, (left.shape[0], left.shape[1]))
+        tracks = merge_tracks([sparse, dense_tracks(fit.greys.views, depth_m, given)])
+    before = median_residuals(tracks, given)
+    report = _with_residuals(_as_given(posed, fit, measured), tracks, before)
+    misses = bool((before > fit.limit_px).any())
+    if np.isnan(before).all() or (misses and fit.rig):
+        return CheckedViews(rights, replace(report, status="not checked"))
+    if not misses:
+        return CheckedViews(rights, report)
+    sizes = [(image.shape[0], image.shape[1]) for image in greys]
+    misfit = _Misfit(rights, sizes, tracks, given, given, fit.limit_px, rig=False, measured=measured)
+    views, report = _refined(misfit, report)
+    return CheckedViews(views, replace(report, warnings=(*report.warnings, _by_flow_alone(sparse, before))))
 
 
 def _with_pictures(report: PoseReport, posed: PosedViews, greys: Sequence[np.ndarray]) -> PoseReport:
@@ -450,6 +484,17 @@ def _undetermined(apart: float) -> tuple[Message, ...]:
         f"{100 * np.expm1(apart):.0f} % in the median. Give a more exact pose, or views from further apart."
     )
     return (Message("pose.undetermined", sentence),)
+
+
+def _by_flow_alone(sparse: Tracks, before: np.ndarray) -> Message:
+    """A message about poses that optical flow misses by ``before (V,)`` where few features match."""
+    found = sparse.seen.sum(1).max(initial=0)
+    sentence = (
+        f"The pose could hardly be checked: of the {FEWEST} matches of features that are needed there are "
+        f"{found}, and with those of optical flow they lie {np.nanmax(before):.1f} px off their epipolar "
+        "lines in the median. Give a more exact pose, or views that show more texture or overlap more."
+    )
+    return Message("pose.few-matches", sentence)
 
 
 def _misses(before: np.ndarray, v: int, least_px: float = WARNS_PX) -> str | None:

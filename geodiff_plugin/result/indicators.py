@@ -163,6 +163,7 @@ def indicators_of(
         known["straightened_px"] = max(pose.straightened_px, default=0.0)
         if not math.isnan(pose.behind_px):  # a product would be another NaN, and verdicts would differ by it
             known["behind_px"] = pose.behind_px * pixels_of_matches(native.size)
+        known["pose_unchecked"] = pose.status == "not checked"
         known["mistakes"] = tuple(m for m in pose.warnings if m.forbids_trust and m.code != INVERSE.code)
     of_rows = None if evidence.rows is None else evidence.rows.result().checks.result()
     if of_rows is not None:

@@ -257,6 +257,19 @@ def _pose_uncertain(found: Indicators) -> bool:
     return math.hypot(*shares) > MOST_TOGETHER
 
 
+def _pose_unproved(found: Indicators) -> bool:
+    """Whether too few matches show if the poses are right, and the depth does not show it either.
+
+    It does where most pixels have the same match from both sides, and the result and the prior follow them,
+    or where known depths agree with them.
+    """
+    if not found.pose_unchecked or _by_points_alone(found):
+        return False
+    followed = found.off_matches < ON_MATCHES and found.rank_correlation >= WEAK_CORRELATION
+    agreed = found.points_ratio > 0 and not _points_wrong(found)
+    return not (agreed or (_well_matched(found) and followed))
+
+
 def _why_exchanged(_: Indicators) -> str:
     return (
         "Near and far are exchanged against the prior, or the inverse pose fits better: are left and "
@@ -515,6 +528,15 @@ REASONS = (
     Rule("views.sheared", lambda found: abs(found.shear) > MOST_SHEAR, _why_sheared),
     Rule("views.distorted", _distorted, _why_distorted),
     Rule("views.bent", lambda found: _bent(found) and not _distorted(found), _why_bent),
+    Rule(
+        "pose.unchecked",
+        _pose_unproved,
+        lambda _: (
+            "Nothing shows whether the pose is right: too few features match to check it, and the depth does "
+            "not confirm it either. Give views that show more texture or overlap more, or pose='given' for a "
+            "pose that is known to be exact."
+        ),
+    ),
     Rule("pose.off-lines", lambda found: found.epipolar_px > EPIPOLAR_WRONG, _why_off_lines),
     Rule("views.disagree", _views_disagree, _why_disagreement),
 )

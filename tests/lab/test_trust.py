@@ -38,6 +38,17 @@ def test_every_kind_of_wrong_calibration_changes_what_it_says(sample):
     np.testing.assert_allclose(cases["inverse"].E @ sample.E, np.eye(4), atol=1e-12)
     turn = Rotation.from_matrix(np.linalg.inv(sample.E[:3, :3]) @ cases["tilted"].E[:3, :3])
     np.testing.assert_allclose(turn.as_rotvec(degrees=True), (2, 0, 0), atol=1e-9)
+    for kind, turn_deg, shift, length in (
+        ("pose-slight", 0.15, 0.03, 1.0),
+        ("pose-far", 2.0, 0.2, 1.0),
+        ("pose-rough-long", 0.6, 0.08, 1.12),
+    ):
+        E = cases[kind].E
+        turn = Rotation.from_matrix(sample.E[:3, :3].T @ E[:3, :3])
+        assert np.degrees(turn.magnitude()) == pytest.approx(turn_deg)
+        baselines = [np.linalg.norm(P[:3, 3]) for P in (sample.E, E)]
+        assert baselines[1] == pytest.approx(length * baselines[0])
+        assert np.linalg.norm(E[:3, 3] / length - sample.E[:3, 3]) < 1.1 * shift * baselines[0]
     points = trust._points(sample)
     column, row = np.rint(points[0] @ sample.K_left.T / points[0, 2]).astype(int)[:2]
     assert len(points) == POINTS and points[0, 2] == pytest.approx(sample.depth_m[row, column], rel=1e-6)

@@ -132,6 +132,22 @@ def _yawed(sample: StereoSample, _: StereoSample) -> StereoSample:
     return replace(sample, E=sample.E @ yaw)
 
 
+def _off_pose(
+    sample: StereoSample, _: StereoSample, *, turn_deg: float, shift: float, length: float = 0.0
+) -> StereoSample:
+    """``E`` turned about, and moved along, axes that chance takes: all errors are independent of each other.
+
+    ``shift`` is in baselines. The baseline then has its own length again, but for the share ``length``.
+    """
+    rng = np.random.default_rng(list(sample.E.tobytes()))
+    axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    turn, centre = np.eye(4), sample.E[:3, 3]
+    turn[:3, :3] = Rotation.from_rotvec(np.radians(turn_deg) * axis).as_matrix()
+    baseline_m = np.linalg.norm(centre)
+    off = centre + shift * baseline_m * way
+    return moved(replace(sample, E=sample.E @ turn), off * (1.0 + length) * baseline_m / np.linalg.norm(off))
+
+
 def _moved_across(sample: StereoSample, _: StereoSample) -> StereoSample:
     """The middle of the right picture, an ellipse of two fifths of it, has moved across the rows as well."""
     height, width = sample.right.shape[:2]
@@ -216,6 +232,20 @@ KINDS: dict[str, Kind] = {
     "saved-twice": Kind("the left image twice, once as a JPEG", _saved_twice),
     "feet": Kind("baseline in feet", lambda s, _: moved(s, s.E[:3, 3] / 0.3048)),
     "yaw": Kind("E turned by 1 degree of yaw", _yawed),
+    "pose-slight": Kind(
+        "E off by 0.15 degrees and 3 % of the baseline", partial(_off_pose, turn_deg=0.15, shift=0.03)
+    ),
+    "pose-rough": Kind(
+        "E off by 0.6 degrees and 8 % of the baseline", partial(_off_pose, turn_deg=0.6, shift=0.08)
+    ),
+    "pose-far": Kind(
+        "E off by 2 degrees and 20 % of the baseline", partial(_off_pose, turn_deg=2.0, shift=0.2)
+    ),
+    "pose-rough-long": Kind(
+        "E off by 0.6 degrees and 8 %, and 12 % too long",
+        partial(_off_pose, turn_deg=0.6, shift=0.08, length=0.12),
+    ),
+    "long": Kind("baseline 12 % too long", lambda s, _: moved(s, 1.12 * s.E[:3, 3])),
     "points-256": Kind("points in 1/256 m read as millimetres", points=0.256),
     "points-mm": Kind("points in millimetres read as metres", points=1000.0),
     "points-3": Kind("points 3 times too far", points=3.0),

@@ -127,6 +127,7 @@ CHARTS = (
         "Shares that were not trusted, and that got a warning or were not trusted",
         (Column(6), Column(7)),
     ),
+    Chart("results-trust", 6, PROMISED, (Column(3), Column(4))),
     Chart("strength", 1, f"Errors by the prior's own error; {LOWER}", names=2, one_scale=False),
     Chart(
         "strength",

@@ -502,6 +502,44 @@ def test_views_are_used_as_given_where_no_better_pose_is_near(pair) -> None:
         assert used == inputs.views
 
 
+@pytest.fixture(scope="module")
+def plain():
+    """Views in which SIFT finds too little."""
+    return render_pair(9, size=(96, 128), posed=True, effects=True)
+
+
+def test_where_features_are_few_optical_flow_shows_whether_a_pose_fits(plain) -> None:
+    right, wrong = plain.E.numpy(), plain.E.numpy() @ pose((1.0, -0.5, 0.5), (0, 0, 0))
+    assert not refine.measure_fit(refine.posed_greys(posed(plain, right))).is_known, "else nothing is tested"
+    given = posed(plain, right)
+    used, report = checked_views(given)
+    assert used == given.views and not report.warnings
+    assert report.status == "fits" and report.residual_px[0] < 0.3 and report.matches[0] > 50
+    _, report = checked_views(posed(plain, wrong))
+    assert report.status == "refined" and report.residual_px[0] < 0.3 < report.residual_px_given[0]
+    assert "pose.few-matches" in [message.code for message in report.warnings]
+    assert all(message.forbids_trust for message in report.warnings if message.code == "pose.few-matches")
+
+
+def test_a_calibration_is_not_changed_for_what_flow_alone_shows() -> None:
+    pair = render_pair(9, size=(96, 128), posed=False, effects=True)
+    assert checked_views(posed(pair, pair.E.numpy())).report.status == "fits"
+    raised = replace(pair, right=replace(pair.right, image_01=torch.roll(pair.right.image_01, 2, dims=-2)))
+    given = posed(raised, pair.E.numpy())
+    assert not refine.measure_fit(refine.posed_greys(given)).is_known, "else nothing is tested"
+    used, report = checked_views(given)
+    assert report.status == "not checked" and used == given.views and report.residual_px[0] > 0.45
+
+
+def test_the_scale_of_a_pose_in_use_is_that_of_the_scene_unless_its_length_was_measured(pair) -> None:
+    """A pair does not show how far its cameras are apart."""
+    given = posed(pair, pair.E.numpy())
+    assert checked_views(given).report.scale_spread == refine.DEPTH_SPREAD
+    assert checked_views(given, measured=True).report.scale_spread is None
+    rig = render_pair(0, size=(240, 320), posed=False)
+    assert checked_views(posed(rig, rig.E.numpy())).report.scale_spread is None
+
+
 def test_everything_downstream_sees_the_refined_pose(pair) -> None:
     true = pair.E.numpy()
     wrong = true @ pose((0.8, -0.9, 0.5), (0, 0, 0))

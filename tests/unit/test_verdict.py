@@ -88,6 +88,7 @@ def test_a_good_run_is_trusted_in_silence():
         ({"scale_spread": 0.16}, "uncertain by 16 %"),
         ({"scale_spread": 0.16, "points": 2, "given_px": 15.2}, "depth: E misses the matches by 15 px"),
         ({"scale_spread": 0.08, "depth_spread": 0.14}, "by 8 %, and another pose .* by 15 %"),
+        ({"pose_unchecked": True, "matched": 0.4}, "Nothing shows whether the pose is right"),
     ],
 )
 def test_reasons(signs, words):

@@ -17,6 +17,8 @@ ALONE = Indicators(points=99, cover=0.5, rank_correlation=0.8)
 ORDERED = {"rank_correlation": -0.5, "exchangeable": 0.1, "epipolar_px": 0.3, "off_matches": 0.01}
 #: What shows that they are.
 HIDDEN = {"rank_correlation": 0.3, "exchangeable": 0.9, "occlusion": -0.9}
+#: A pose that nobody could check, of a depth that confirms it.
+UNCHECKED = {"pose_unchecked": True, "off_matches": 0.01}
 #: Codes of reasons and remarks, what is given beside, the indicator, and values without and with the message.
 TABLE = (
     ("depth.off-matches", {}, "off_matches", math.log(1.19), math.log(1.21)),
@@ -62,6 +64,12 @@ TABLE = (
     ("pose.undetermined", {"depth_spread": 0.1472}, "scale_spread", 0.068, 0.070),
     ("pose.undetermined", {"depth_spread": 0.15}, "scale_spread", 0.11, 0.09),  # then it is the scale
     ("pose.undetermined", {"scale_spread": 0.09, "depth_spread": 0.15}, "points", 3, 2),
+    ("pose.unchecked", {"off_matches": 0.5}, "pose_unchecked", False, True),
+    ("pose.unchecked", UNCHECKED, "matched", 0.51, 0.49),
+    ("pose.unchecked", UNCHECKED, "rank_correlation", 0.46, 0.44),
+    ("pose.unchecked", UNCHECKED, "off_matches", math.log(1.04), math.log(1.06)),
+    ("pose.unchecked", UNCHECKED | {"matched": 0.4, "points": 99}, "points_ratio", 1.19, 1.21),
+    ("pose.unchecked", UNCHECKED | {"matched": 0.4, "points": 99}, "points_ratio", 1.0, math.nan),
     ("prior.metres", {}, "prior_ratio", 1.85, 1.95),
     ("prior.metres", {}, "prior_ratio", 1 / 1.85, 1 / 1.95),
     ("prior.metres", {}, "prior_ratio", 20.5, 19.5),
