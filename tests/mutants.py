@@ -850,6 +850,23 @@ MUTANTS = [
         tests=(f"{UNIT}bags.py",),
     ),
     *of(
+        "runtime/graphs.py",
+        ("stream.wait_stream(self._latest)", "pass"),
+        ("with torch.cuda.device(device):", "with torch.cuda.device(0):"),
+        tests=("tests/integration/test_graphs.py",),
+    ),
+    *of(
+        "pose/refine.py",
+        ("<= SURELY * fit.limit_px", "<= 9.0 * fit.limit_px"),
+        ("replace(fit, surely=surely_fits(greys) if", "replace(fit, surely=False if"),
+        tests=(f"{UNIT}pose_refine.py",),
+    ),
+    *of(
+        "pose/tracks.py",
+        ("np.array(large.shape[::-1]) / small.shape[::-1]", "1.0"),
+        tests=(f"{UNIT}pose_refine.py",),
+    ),
+    *of(
         "_threads.py",
         ("                ready.wait()", "                pass"),
         ("stream.wait_stream(self._stream)", "pass"),
@@ -859,7 +876,8 @@ MUTANTS = [
         ("if self._answer.exception() is None", "if self._answer.done()"),
         ("        arrived.synchronize()", "        pass"),
         ("                    part.close()", "                    pass"),
-        ("self._stream.record_event(), _stream_beside(device)", "None, _stream_beside(device)"),
+        ("self._stream.record_event() if follows else None", "None"),
+        ("stream not in self._waiting", "not self._waiting"),
         tests=(f"{UNIT}beside.py", "tests/integration/test_threads.py"),
     ),
     *of(
