@@ -42,6 +42,7 @@ def run_and_show(measure: Callable[[Any], Any], options: Any) -> None:
         typer.echo(result)
     elif result is not None and not options.quiet:
         _print_page(result)
+        typer.echo(f"-> {options.out}/")
     if broken := getattr(result, "broken", ()):
         some = ", ".join(broken[:MOST_NAMES]) + ", ..." * (len(broken) > MOST_NAMES)
         count = "1 broken sample was" if len(broken) == 1 else f"{len(broken)} broken samples were"

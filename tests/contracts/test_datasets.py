@@ -225,7 +225,7 @@ def test_sets_below_one_root_are_told_apart_and_ordered(tmp_path):
     for name in reversed(names):
         write(tmp_path / name, LAYOUTS[name])
     assert [ref.dataset for ref in find_pairs(tmp_path)] == names
-    with pytest.raises(ValueError, match="root must be an existing folder"):
+    with pytest.raises(ValueError, match=r"root \(DIR, --data\) must be an existing folder"):
         find_pairs(tmp_path / "nowhere")
     with pytest.raises(ValueError, match="datasets must be one of kitti2015"):
         find_pairs(tmp_path, ["kitty"])

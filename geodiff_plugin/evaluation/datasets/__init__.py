@@ -48,7 +48,7 @@ def find_pairs(root: str | Path, datasets: Iterable[str] | None = None, **option
         given = {key: options[key] for key in dataset.options if options.get(key) is not None}
         refs += dataset.find(root, **given)
     if not refs and not os.path.isdir(root):
-        bad_value("root", "an existing folder", str(root))
+        bad_value("root (DIR, --data)", "an existing folder", str(root))
     return refs
 
 
@@ -69,13 +69,18 @@ def some_pairs(refs: Sequence[SampleRef], data: Path, scenes: Sequence[str] = ()
     if not kept:
         there = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
         wanted = f" with {', '.join(scenes)} in its name" if scenes else ""
-        cure = "geodiff eval list says how to obtain the public ones; docs/how-to/extending.md adds others."
-        bad_value("--data", f"a folder with a sample{wanted}", f"{data} with {there}", cure)
+        cure = (
+            "A pair of your own is a folder of left.png, right.png, calib.txt and depth.npy. geodiff eval list "
+            "says how to obtain the public ones; docs/how-to/extending.md adds others."
+        )
+        bad_value("DIR (--data)", f"a folder with a sample{wanted}", f"{data} with {there}", cure)
     # As two resolutions of a set have: records could not tell them apart.
     label, count = Counter(ref.label for ref in kept).most_common(1)[0]
     if count > 1:
         cure = "Name the folder of one of them, for instance that of one resolution."
-        bad_value("--data", "a folder with one sample of each name", f"{data} with several {label}", cure)
+        bad_value(
+            "DIR (--data)", "a folder with one sample of each name", f"{data} with several {label}", cure
+        )
     return kept
 
 
