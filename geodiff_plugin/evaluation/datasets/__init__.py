@@ -70,8 +70,8 @@ def some_pairs(refs: Sequence[SampleRef], data: Path, scenes: Sequence[str] = ()
         there = ", ".join(ref.label for ref in refs) or "no sample of any known data set"
         wanted = f" with {', '.join(scenes)} in its name" if scenes else ""
         cure = (
-            "A pair of your own is a folder of left.png, right.png, calib.txt and depth.npy. geodiff eval list "
-            "says how to obtain the public ones; docs/how-to/extending.md adds others."
+            "A pair of your own is a folder of left.png, right.png, calib.txt and depth.npy. geodiff eval "
+            "list says how to obtain the public ones; docs/how-to/extending.md adds others."
         )
         bad_value("DIR (--data)", f"a folder with a sample{wanted}", f"{data} with {there}", cure)
     # As two resolutions of a set have: records could not tell them apart.
