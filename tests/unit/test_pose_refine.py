@@ -589,6 +589,23 @@ def test_evidence_made_beside_the_check_of_the_poses_is_the_same(
     assert torch.equal(alone.volume.levels, beside.volume.levels)
 
 
+def test_flow_is_asked_about_few_features_beside_the_matching_as_well(pair, monkeypatch) -> None:
+    """As on CUDA: too few features do not show that the poses fit, by which the views were matched."""
+    E = pair.E.numpy() @ pose((0.8, -0.8, 0), (0, 0, 0))
+    left, right = pair.left.image_01.float(), pair.right.image_01.float()
+    guidance = GeometryGuidance(right, (pair.K_left.numpy(), pair.K_right.numpy()), E)
+    posed = guidance.inputs[0].beside(left)
+    count = int(refine.measure_fit(refine.posed_greys(posed), lambda: False).tracks.seen.sum())
+    for module in (refine, tracks_module):
+        monkeypatch.setattr(module, "FEWEST", count + 1)
+    (alone,) = guidance.prepare(left[None])
+    for module in ("_threads", "evidence.prepare"):
+        monkeypatch.setattr(f"geodiff_plugin.{module}.leaves_cpu_free", lambda device: True)
+    (beside,) = guidance.prepare(left[None])
+    assert [each.report.result().status for each in (alone, beside)] == ["refined", "refined"]
+    assert torch.equal(alone.volume.levels, beside.volume.levels)
+
+
 def test_evidence_of_poses_that_fit_is_there_before_all_is_known_about_them(pair, monkeypatch) -> None:
     """As on CUDA: what else the check finds is for act 3, so denoising does not wait for it."""
     asked = threading.Event()
