@@ -60,6 +60,13 @@ class _Surface(NamedTuple):
     links: tuple[Tensor, Tensor]  # ``edge_links``, across and down
 
 
+class _Wanted(NamedTuple):
+    """What the values of a surface are drawn to, and how firmly they are held, on the grid of the matches."""
+
+    slopes: Tensor  # (2, 1, h, w), smoothed, across and down
+    held: Tensor  # (1, 1, h, w), weight of the values by what the matches know
+
+
 @torch.no_grad()
 def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor, denoised_m: Tensor) -> Tensor:
     """Make the slopes of inverse depth alike where the matches know little, and leave the rest as it is.
@@ -93,24 +100,39 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor, de
     """
     log_depth = depth_m.float().log()
     unit, good = log_depth.mean(), (WEAK_PRIOR / error).clamp_min(1.0) ** 4
-    edge = (DEPTH_EDGE / good.sqrt()).clamp_min(DETAIL_EDGE)
     on_grid = _on(log_depth, target.size)
-    fitted = _links(on_grid, left_01, edge)
-    denoised = _links(log_depth_at(denoised_m, target.size), left_01, DENOISED_EDGE)
-    links = torch.minimum(fitted[0], denoised[0]), torch.minimum(fitted[1], denoised[1])
-    surface = _Surface(torch.exp(unit - on_grid), links)
+    surface = _Surface(torch.exp(unit - on_grid), _links_of_walls(on_grid, denoised_m, left_01, good))
     known = known_shape(target, torch.exp(-on_grid))
-    slopes, held = _smoothed(surface, known), _held(known)
-    change = _towards(slopes, surface, _relative(held + LEAST_VALUE_WEIGHT * good, surface))
+    wanted = _Wanted(_smoothed(surface, known), _held(known))
+    weight = _relative(wanted.held + LEAST_VALUE_WEIGHT * good, surface)
+    change = _towards(wanted.slopes, surface, weight)
     lowering = _on(_lowering(surface, change), image_size(depth_m))
-    size = grid_of_rows(image_size(depth_m))
-    on_grid = _on(log_depth - lowering, size)
-    surface = _Surface(torch.exp(unit - on_grid), _links(on_grid, left_01, DETAIL_EDGE))
-    finer = constant_like(slopes, target.size[1] / size[1], target.size[0] / size[0]).view(2, 1, 1, 1)
-    weight = _relative(_on(held, size) + LEAST_DETAIL_WEIGHT * good, surface)
-    change = _towards(finer * _on(slopes, size), surface, weight, torch.zeros_like(weight))
-    lowering = lowering + _on(_lowering(surface, change), image_size(depth_m))
+    lowering = lowering + _lowering_of_detail(log_depth - lowering, unit, wanted, left_01, good)
     return (depth_m * torch.exp(-lowering)).to(depth_m.dtype)
+
+
+def _links_of_walls(
+    log_depth: Tensor, denoised_m: Tensor, left_01: Tensor, good: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Links on the grid of the matches, across and down; ``good`` is by how much more its values weigh."""
+    edge = (DEPTH_EDGE / good.sqrt()).clamp_min(DETAIL_EDGE)
+    fitted = _links(log_depth, left_01, edge)
+    denoised = _links(log_depth_at(denoised_m, image_size(log_depth)), left_01, DENOISED_EDGE)
+    return torch.minimum(fitted[0], denoised[0]), torch.minimum(fitted[1], denoised[1])
+
+
+def _lowering_of_detail(
+    log_depth: Tensor, unit: Tensor, wanted: _Wanted, left_01: Tensor, good: Tensor
+) -> Tensor:
+    """By how much the second problem, on the grid of the votes, lowers the log depth ``(1, 1, H, W)``."""
+    (height, width), size = image_size(wanted.held), grid_of_rows(image_size(log_depth))
+    on_grid = _on(log_depth, size)
+    surface = _Surface(torch.exp(unit - on_grid), _links(on_grid, left_01, DETAIL_EDGE))
+    # A slope is the change from one pixel to the next, and the pixels of this grid are smaller.
+    smaller = constant_like(wanted.slopes, width / size[1], height / size[0]).view(2, 1, 1, 1)
+    weight = _relative(_on(wanted.held, size) + LEAST_DETAIL_WEIGHT * good, surface)
+    change = _towards(smaller * _on(wanted.slopes, size), surface, weight, torch.zeros_like(weight))
+    return _on(_lowering(surface, change), image_size(log_depth))
 
 
 def _on(x: Tensor, size: tuple[int, int], *, antialias: bool = False) -> Tensor:
