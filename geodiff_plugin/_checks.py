@@ -91,7 +91,7 @@ def check_number(value: Any, name: str, low: float, high: float, *, integer: boo
     if not low <= value <= high or value in (float("inf"), float("-inf")):
         endless = isinstance(value, int) and value.bit_length() > 128
         got = "a whole number of more than 128 bits" if endless else value
-        bad_value(name, f"between {low:g} and {high:g}", got)
+        bad_value(name, f"between {low:.15g} and {high:.15g}", got)
     return value
 
 
