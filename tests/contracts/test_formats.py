@@ -204,7 +204,10 @@ def test_how_many_files_a_format_needs(tmp_path):
         ((K, K.replace("0.12", "0.2")), "is given once"),
         ((text, text.replace("700.0", "701.0")), "M1 must be there once; got m1, m1, which differ"),
         ((K, SAMPLES["middlebury"][0]), "files of one format; got foundation_stereo and middlebury"),
-        *(((SAMPLES[name][0],), "has: 2; .*Give --calib twice") for name in ("mvsnet", "ros", "colmap")),
+        *(
+            ((SAMPLES[name][0],), "must be 2 files of this format, .*; got 1, .*Give both: --calib twice")
+            for name in ("mvsnet", "ros", "colmap")
+        ),
     ):
         with pytest.raises(InputError, match=said):
             of.read_texts(tmp_path, *texts)
