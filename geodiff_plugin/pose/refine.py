@@ -490,9 +490,9 @@ def _by_flow_alone(sparse: Tracks, before: np.ndarray) -> Message:
     """A message about poses that optical flow misses by ``before (V,)`` where few features match."""
     found = sparse.seen.sum(1).max(initial=0)
     sentence = (
-        f"The pose could hardly be checked: {found} features match where {FEWEST} are needed. Together with "
-        f"matches of optical flow they lie {np.nanmax(before):.1f} px off their epipolar lines in the median. "
-        "Give a more exact pose, or views that show more texture or overlap more."
+        f"The pose could hardly be checked: {found} features match where {FEWEST} are needed. Together "
+        f"with matches of optical flow they lie {np.nanmax(before):.1f} px off their epipolar lines in the "
+        "median. Give a more exact pose, or views that show more texture or overlap more."
     )
     return Message("pose.few-matches", sentence)
 
