@@ -84,6 +84,11 @@ def _check_kind(value: Any, name: str, integer: bool) -> None:
         bad_type(name, "an integer" if integer else "a number", value)
 
 
+def number_text(number: float) -> str:
+    """A number as people write it: 4294967296, where ``g`` alone would round it to 4.29497e+09."""
+    return f"{number:.15g}"
+
+
 def check_number(value: Any, name: str, low: float, high: float, *, integer: bool = False) -> Any:
     """A finite number in ``[low, high]``, returned as it came."""
     _check_kind(value, name, integer)
@@ -91,7 +96,7 @@ def check_number(value: Any, name: str, low: float, high: float, *, integer: boo
     if not low <= value <= high or value in (float("inf"), float("-inf")):
         endless = isinstance(value, int) and value.bit_length() > 128
         got = "a whole number of more than 128 bits" if endless else value
-        bad_value(name, f"between {low:.15g} and {high:.15g}", got)
+        bad_value(name, f"between {number_text(low)} and {number_text(high)}", got)
     return value
 
 

@@ -21,6 +21,7 @@ from geodiff_plugin._checks import (
     check_flag,
     check_number,
     check_range,
+    number_text,
     warn,
 )
 from geodiff_plugin.messages import Message
@@ -66,7 +67,7 @@ def _knob(
 def _number(default: float | None, low: float, high: float, kind: type = float, **more: str) -> Any:
     """A finite number in ``[low, high]``, or a whole one."""
     whole = kind is int
-    values = f"{'integer, ' * whole}[{low:g}, {high:g}]"
+    values = f"{'integer, ' * whole}[{number_text(low)}, {number_text(high)}]"
     return _knob(
         default, values, lambda v, name: kind(check_number(v, name, low, high, integer=whole)), **more
     )

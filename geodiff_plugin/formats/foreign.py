@@ -24,6 +24,12 @@ class ForeignCalibration:
 
 ONE_CAMERA = "It is of one camera: give the stereo calibration, or K and E of the pair (--K, --K-right, --E)."
 OF_PAIR = "Give K of both, and as --E the right camera's pose in the left camera's frame, in metres."
+#: How a file of RealEstate10K begins: a video, then a frame's time and 18 numbers of its camera.
+REAL_ESTATE_10K = r"\Ahttps?://\S+\s+\d+(?:[ \t]+[-+.\deE]+){18}"
+REAL_ESTATE_10K_CURE = (
+    "Write it as transforms.json: its fx fy cx cy are shares of the image's width and height, and its 3x4 "
+    "matrix maps the world to the camera."
+)
 SAVE_NPZ = "In Python: np.savez('calib.npz', K1=K1, D1=D1, K2=K2, D2=D2, R=R, T=T) of its matrices."
 FOREIGN_CALIBRATIONS = (
     ForeignCalibration(
@@ -91,9 +97,9 @@ FOREIGN_CALIBRATIONS = (
         f"Its R and C are from the camera to the world. {OF_PAIR}",
     ),
     ForeignCalibration(
-        r"\Ahttps?://\S+\s+\d+([ \t]+[-+.\deE]+){18}",
+        REAL_ESTATE_10K,
         "a sequence of RealEstate10K",
-        "Write it as transforms.json: its fx fy cx cy are shares of the sides, its 3x4 from the world.",
+        REAL_ESTATE_10K_CURE,
     ),
     ForeignCalibration(
         r"\A# Bundle file|\ANVM_V3|<document[^>]*>\s*<chunk|\A\s*\[\s*\{[\s\S]*\"(shots|cameras)\"",

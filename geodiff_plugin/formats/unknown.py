@@ -13,6 +13,7 @@ from typing import NoReturn
 
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.formats.files import check_file
+from geodiff_plugin.formats.foreign import REAL_ESTATE_10K, REAL_ESTATE_10K_CURE
 from geodiff_plugin.formats.layouts import CaptureFormat
 from geodiff_plugin.messages import Message
 
@@ -135,8 +136,8 @@ FOREIGN = (
     ForeignFormat(
         ("*.txt",),
         "a sequence of RealEstate10K",
-        "Write it as transforms.json: its fx fy cx cy are shares of the sides, its 3x4 from the world.",
-        r"\Ahttps?://\S+\s+\d+(?:[ \t]+[-+.\deE]+){18}",
+        REAL_ESTATE_10K_CURE,
+        REAL_ESTATE_10K,
     ),
     ForeignFormat(
         ("ARKit_camera_pose.txt",),

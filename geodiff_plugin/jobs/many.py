@@ -78,9 +78,9 @@ class Stages:
     """The stages of a pair, each called in a thread of its own.
 
     A ``pipe`` that is not given is loaded when the first pair has been read; ``among`` stages compute at the
-    same time and share the cores; ``tell`` hears which prior it is, and what was assumed. Beside a GPU
-    so many ``writers``, processes of their own, write the pairs: a thread that writes would keep the others,
-    which launch kernels, from Python's lock. They start at once, while the prior is loaded. Without any, as
+    same time and share the cores; ``tell`` hears which prior it is, and what was assumed. Beside a GPU the
+    pairs are written by ``writers`` separate processes: a thread that writes would keep the threads that
+    launch kernels from Python's lock. They start at once, while the prior is loaded. If ``writers`` is 0, as
     on a CPU, a thread writes.
     """
 
@@ -95,7 +95,6 @@ class Stages:
         writers: int = 0,
     ) -> None:
         self._options, self._device, self._pipe = options, device, pipe
-        self._works_on: torch.device | None = None  # the pipeline
         self._among, self._tell = among, tell
         self._views, self._folders = Views(options), dict[str, ExitStack]()
         self._writers = SeparateProcesses(write_row.__module__, writers) if writers else None
@@ -139,17 +138,21 @@ class Stages:
                 self._pipe = prior_of_options(replace(self._options, graphs=graphs), self._device, tell)
             except Exception as error:
                 raise _EndsRun from error
-        if self._works_on is None:
-            self._works_on = self._pipe._execution_device  # looks through all layers
-        device, guidance, left = self._works_on, pair.inputs.guidance, pair.inputs.left
+        device, guidance, left = self._device_of_pipe, pair.inputs.guidance, pair.inputs.left
         plain, kernels = torch.autocast(device.type, enabled=False), without_kernels(self._options.no_kernels)
         with pair.log.stage("evidence"), WithinCores(self._among), torch.no_grad(), plain, kernels:
             guidance.evidence_store = EvidenceStore(1, copies=False)
-            # All threads have one stream by default, to which the pair before is still sent, and waiting for
-            # its network would leave nothing of working side by side.
+            # Threads share a stream by default, and the network of the pair before still runs on it. The
+            # evidence has a stream of its own, which does not wait for that network.
             work = functools.partial(_prepare, guidance, left, device)
             Beside(work, device, own_stream=True, follows=False).result()
         return pair
+
+    @functools.cached_property
+    def _device_of_pipe(self) -> torch.device:
+        """Found once, as the pipeline looks through all of its layers for it."""
+        device: torch.device = self._pipe._execution_device
+        return device
 
     def guide(self, pair: _OnItsWay) -> _OnItsWay:
         """The guided call."""

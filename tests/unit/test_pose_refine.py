@@ -561,6 +561,23 @@ def test_everything_downstream_sees_the_refined_pose(pair) -> None:
     assert np.allclose(np.linalg.inv(given.native.views[0][2].numpy()), wrong, atol=1e-5)
 
 
+def check_beside_matching(monkeypatch) -> None:
+    """As on CUDA: the poses are checked in threads beside the matching of the views."""
+    for module in ("_threads", "evidence.prepare"):
+        monkeypatch.setattr(f"geodiff_plugin.{module}.leaves_cpu_free", lambda device: True)
+
+
+def hold_until(asked: threading.Event, name: str, monkeypatch) -> None:
+    """Let a function of the check wait for the event where evidence is made."""
+    function = getattr(refine, name)
+
+    def patient(*args):
+        assert asked.wait(60)
+        return function(*args)
+
+    monkeypatch.setattr(f"geodiff_plugin.evidence.prepare.{name}", patient)
+
+
 @pytest.mark.parametrize(
     ("turn_deg", "noise", "status"), [(0.0, 0.0, "fits"), (0.8, 0.0, "refined"), (0.0, 0.012, "kept")]
 )
@@ -578,8 +595,7 @@ def test_evidence_made_beside_the_check_of_the_poses_is_the_same(
     guidance = GeometryGuidance(right, (pair.K_left.numpy(), pair.K_right.numpy()), E)
     (alone,) = guidance.prepare(left[None])
     assert torch.equal(alone.native.left_01, left) == (noise == 0.0)
-    for module in ("_threads", "evidence.prepare"):
-        monkeypatch.setattr(f"geodiff_plugin.{module}.leaves_cpu_free", lambda device: True)
+    check_beside_matching(monkeypatch)
     (beside,) = guidance.prepare(left[None])
     reports = [each.report.result() for each in (alone, beside)]
     assert all(report.status == status for report in reports)
@@ -599,8 +615,7 @@ def test_flow_is_asked_about_few_features_beside_the_matching_as_well(pair, monk
     for module in (refine, tracks_module):
         monkeypatch.setattr(module, "FEWEST", count + 1)
     (alone,) = guidance.prepare(left[None])
-    for module in ("_threads", "evidence.prepare"):
-        monkeypatch.setattr(f"geodiff_plugin.{module}.leaves_cpu_free", lambda device: True)
+    check_beside_matching(monkeypatch)
     (beside,) = guidance.prepare(left[None])
     assert [each.report.result().status for each in (alone, beside)] == ["refined", "refined"]
     assert torch.equal(alone.volume.levels, beside.volume.levels)
@@ -610,13 +625,8 @@ def test_evidence_of_poses_that_fit_is_there_before_all_is_known_about_them(pair
     """As on CUDA: what else the check finds is for act 3, so denoising does not wait for it."""
     asked = threading.Event()
 
-    def patient(*args):
-        assert asked.wait(60)
-        return refine.refine_views(*args)
-
-    monkeypatch.setattr("geodiff_plugin.evidence.prepare.refine_views", patient)
-    for module in ("_threads", "evidence.prepare"):
-        monkeypatch.setattr(f"geodiff_plugin.{module}.leaves_cpu_free", lambda device: True)
+    hold_until(asked, "refine_views", monkeypatch)
+    check_beside_matching(monkeypatch)
     guidance = GeometryGuidance(
         pair.right.image_01, (pair.K_left.numpy(), pair.K_right.numpy()), pair.E.numpy()
     )
@@ -639,13 +649,8 @@ def test_small_pictures_that_show_that_poses_fit_are_enough(monkeypatch) -> None
     """As on CUDA: denoising does not wait for the features of the pictures themselves."""
     asked = threading.Event()
 
-    def patient(*args):
-        assert asked.wait(60)
-        return refine.measure_fit(*args)
-
-    monkeypatch.setattr("geodiff_plugin.evidence.prepare.measure_fit", patient)
-    for module in ("_threads", "evidence.prepare"):
-        monkeypatch.setattr(f"geodiff_plugin.{module}.leaves_cpu_free", lambda device: True)
+    hold_until(asked, "measure_fit", monkeypatch)
+    check_beside_matching(monkeypatch)
     shown = read_demo_pair()
     guidance = GeometryGuidance(shown.right, (shown.rig.K_left, shown.rig.K_right), shown.rig.E)
     (made,) = guidance.prepare(torch.from_numpy(shown.left).permute(2, 0, 1)[None])
