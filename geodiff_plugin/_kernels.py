@@ -21,6 +21,8 @@ import torch
 #: A kernel that every guided call with a second view launches, by its name in Triton's cache.
 ALWAYS_LAUNCHED = "paths_kernel"
 _switched_on: ContextVar[bool] = ContextVar("geodiff_kernels", default=True)
+#: Triton's caches that hold compiled kernels: looking through one takes milliseconds, so it is done once.
+_FILLED = set[Path]()
 
 
 @functools.cache
@@ -72,7 +74,9 @@ def compilation_ahead(device: torch.device) -> str | None:
         return None
     home = Path(os.environ.get("TRITON_HOME") or Path.home())
     cache = Path(os.environ.get("TRITON_CACHE_DIR") or home / ".triton" / "cache")
-    if any(cache.glob(f"*/{ALWAYS_LAUNCHED}.cubin")):
+    if cache not in _FILLED and any(cache.glob(f"*/{ALWAYS_LAUNCHED}.cubin")):
+        _FILLED.add(cache)
+    if cache in _FILLED:
         return None
     return "The first guided call compiles its Triton kernels, which takes some seconds; Triton keeps them."
 
