@@ -279,29 +279,37 @@ def _residual_tile(system, pull, x, work, now, p, n, width, stride, area):
 
 
 @triton.jit
-def _direction_at(work, area, p, n, share, step):
-    """The new direction at pixels: the preconditioned residual, and a share of the direction before."""
+def _parts_of_direction(work, area, p, n, step):
+    """What the new direction at pixels is made of: the preconditioned residual, and the direction before."""
     inside = (p >= 0) & (p < n)
     here = tl.load(work + area + p, inside, 0.0, cache_modifier=".cg")
     old = work + (5 - step % 2) * area
-    return here + share * tl.load(old + p, inside & (step > 0), 0.0, cache_modifier=".cg")
+    return here, tl.load(old + p, inside & (step > 0), 0.0, cache_modifier=".cg")
 
 
 @triton.jit
 def _direction_tile(system, work, partial, step, tile, tiles, count, p, n, width, stride, area):
-    """The direction of a step in a tile, its image under the matrix, and the sum of their product."""
+    """The direction of a step in a tile, its image under the matrix, and the sum of their product.
+
+    All pixels are read before the sums, which make threads wait for each other: so both waits are one.
+    """
     inside = p < n
+    diagonal, to_left, to_right, to_upper, to_lower = _row_of_matrix(system, p, n, width, stride)
+    # The direction of the step before is read by other programs while the new one is written.
+    here, before = _parts_of_direction(work, area, p, n, step)
+    left, left_before = _parts_of_direction(work, area, p - 1, n, step)
+    right, right_before = _parts_of_direction(work, area, p + 1, n, step)
+    upper, upper_before = _parts_of_direction(work, area, p - width, n, step)
+    lower, lower_before = _parts_of_direction(work, area, p + width, n, step)
     share = _total(partial + (step % 2) * count, tiles)
     share /= tl.maximum(_total(partial + ((step + 1) % 2) * count, tiles), TINY)
     share = tl.where(step > 0, share, 0.0)  # there is no step before the first
-    diagonal, to_left, to_right, to_upper, to_lower = _row_of_matrix(system, p, n, width, stride)
-    # The direction of the step before is read by other programs while the new one is written.
-    here = _direction_at(work, area, p, n, share, step)
+    here += share * before
     value = diagonal * here
-    value -= to_left * _direction_at(work, area, p - 1, n, share, step)
-    value -= to_right * _direction_at(work, area, p + 1, n, share, step)
-    value -= to_upper * _direction_at(work, area, p - width, n, share, step)
-    value -= to_lower * _direction_at(work, area, p + width, n, share, step)
+    value -= to_left * (left + share * left_before)
+    value -= to_right * (right + share * right_before)
+    value -= to_upper * (upper + share * upper_before)
+    value -= to_lower * (lower + share * lower_before)
     tl.store(work + (4 + step % 2) * area + p, here, inside)
     tl.store(work + 2 * area + p, value, inside)
     tl.store(partial + 2 * count + tile, tl.sum(tl.where(inside, here * value, 0.0), 0))
@@ -311,12 +319,15 @@ def _direction_tile(system, work, partial, step, tile, tiles, count, p, n, width
 def _update_tile(x, work, partial, step, tile, tiles, count, p, n, area):
     """Iterate and residual of a tile after the step along its direction, and the residual's sum."""
     inside = p < n
+    moved, direction = _value_at(x, p, n), _value_at(work + (4 + step % 2) * area, p, n)
+    rest, image = _value_at(work, p, n), _value_at(work + 2 * area, p, n)
+    inverse = _value_at(work + 3 * area, p, n)
     length = _total(partial + (step % 2) * count, tiles)
     length /= tl.maximum(_total(partial + 2 * count, tiles), TINY)
-    moved = _value_at(x, p, n) + length * _value_at(work + (4 + step % 2) * area, p, n)
+    moved += length * direction
     tl.store(x + p, moved, inside)
-    rest = _value_at(work, p, n) - length * _value_at(work + 2 * area, p, n)
-    z = rest * _value_at(work + 3 * area, p, n)
+    rest -= length * image
+    z = rest * inverse
     tl.store(work + p, rest, inside)
     tl.store(work + area + p, z, inside)
     tl.store(partial + ((step + 1) % 2) * count + tile, tl.sum(tl.where(inside, rest * z, 0.0), 0))
