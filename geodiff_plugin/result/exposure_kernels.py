@@ -77,7 +77,7 @@ def _cell(i, j, height, width):
     return top, side, rows, columns
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["height", "width"])
 def cells_kernel(
     left, warped, visible, sums, squares, parts, height, width,
     CHANNELS: tl.constexpr, PIXELS: tl.constexpr,

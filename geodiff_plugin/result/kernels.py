@@ -111,7 +111,7 @@ def _error_and_map_vote(error, crispness):
     return at_edges, better * better * better * _MAP_VOTE
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["height", "width"])
 def vote_kernel(
     depth_m, inverse_depth, confidence, known, row_shift, certain, filled, image, error, crispness, voted,
     px, closeness, height, width, CHANNELS: tl.constexpr, BLOCK: tl.constexpr, VOTES: tl.constexpr,
@@ -152,7 +152,7 @@ def vote_kernel(
     tl.store(voted + pixel, _mean_near_median(tl.where(is_vote, votes, own_shift), weight), exists)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["height", "width"])
 def median_kernel(
     voted, confidence, error, crispness, smooth, height, width,
     BLOCK: tl.constexpr, IN_MEDIAN: tl.constexpr,
@@ -385,7 +385,7 @@ def _rounded(x):
     return below + tl.where((part > 0.5) | ((part == 0.5) & (is_odd > 0.5)), 1.0, 0.0)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["rows", "columns", "height", "width"])
 def enlarge_kernel(
     voted, image, whole, large, rows, columns, height, width,
     CHANNELS: tl.constexpr, BLOCK: tl.constexpr, AROUND: tl.constexpr,

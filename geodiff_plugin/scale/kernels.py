@@ -261,7 +261,10 @@ def _bounds(near, far, FORM: tl.constexpr):
     return tl.minimum(low0, high0), tl.minimum(low1, high1), tl.maximum(low0, high0), tl.maximum(low1, high1)
 
 
-@triton.jit(do_not_specialize=["count", "stride", "iterations"])
+@triton.jit(
+    do_not_specialize=["count", "stride", "iterations"],
+    do_not_specialize_on_alignment=["near_m", "far_m"],
+)
 def refine_kernel(
     x, at, map_inverse, map_confidence, step, near_m, far_m, scratch, refined,
     count, stride, height, width, rows, columns, iterations,

@@ -35,6 +35,11 @@ GROUPED_PIXELS = 16
 GROUPED_PLANES = 64
 #: Candidates of the coarsest grids, as a power of two.
 PADDED = triton.next_power_of_2(max(points.BASIN_CANDIDATES, volume_search.COARSE_GRID) ** 2)
+#: Arrays of one number a candidate or a map. They begin anywhere, and no kernel is compiled anew for where.
+_NUMBERS = [
+    *("near_m", "far_m", "cost", "near_of", "far_of", "chosen"),
+    *("before_cost", "before_near", "before_far", "cost_of", "size"),
+]
 
 
 class _Candidates(NamedTuple):
@@ -84,7 +89,10 @@ def _scale_and_shift(near, far, FORM: tl.constexpr):
     return tl.maximum(s, _LEAST_SHARE), tl.maximum(t, _LEAST_SHARE), g
 
 
-@triton.jit(do_not_specialize=["count", "stride", "in_use"])
+@triton.jit(
+    do_not_specialize=["count", "stride", "height", "width", "rows", "columns", "in_use"],
+    do_not_specialize_on_alignment=_NUMBERS,
+)
 def basin_kernel(
     x, at, map_inverse, step, extremes, near_m, far_m, cost, near_of, far_of,
     count, stride, height, width, rows, columns, in_use,
@@ -192,7 +200,10 @@ def _look_up(
     return tl.sum(summed, 0) / tl.maximum(count, 1.0), count / pixels
 
 
-@triton.jit(do_not_specialize=["pixels", "groups", "planes", "before", "grid", "in_use"])
+@triton.jit(
+    do_not_specialize=["pixels", "groups", "planes", "before", "grid", "in_use"],
+    do_not_specialize_on_alignment=_NUMBERS,
+)
 def level_kernel(
     mean, size, seen, cost, near_m, far_m, before_cost, before_near, before_far, cost_of, near_of, far_of,
     pixels, groups, planes, first_plane, step, least, low, high, reach, before, grid, in_use,
@@ -234,7 +245,7 @@ def level_kernel(
     tl.store(far_of + into, far)
 
 
-@triton.jit(do_not_specialize=["count", "in_use"])
+@triton.jit(do_not_specialize=["count", "in_use"], do_not_specialize_on_alignment=_NUMBERS)
 def choose_kernel(cost, near_of, far_of, chosen, factor, margin, count, in_use, PADDED: tl.constexpr):
     """The best candidate, or the range in use if that is nearly as good. Grid: maps."""
     of_map = tl.program_id(0)
