@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextvars
 import functools
 import os
+import threading
 from collections.abc import Callable, Iterator, Mapping, ValuesView
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import is_dataclass
@@ -100,13 +101,22 @@ class Beside(Generic[T]):
                 ready = self._stream.record_event() if follows else None
                 self._stream = _stream_beside(device)
 
+        begun = threading.Event()
+
         def work() -> T:
+            begun.set()
             with torch.no_grad(), torch.cuda.stream(self._stream):
                 if ready is not None:
                     ready.wait()
                 return context.run(function)
 
-        self._answer = _in_new_thread(work) if own_stream else _threads_beside(os.getpid()).submit(work)
+        if not own_stream:
+            self._answer = _threads_beside(os.getpid()).submit(work)
+            return
+        self._answer = _in_new_thread(work)
+        # The thread has Python's lock then. Otherwise the caller, who will wait for it, keeps that for
+        # milliseconds before the thread asks anything of the device.
+        begun.wait()
 
     @classmethod
     def known(cls, answer: T) -> Beside[T]:

@@ -418,7 +418,9 @@ MUTANTS = [
         ("0.0 if misfit.rig else depths_apart", "depths_apart"),
         ("None if fit.rig or measured else DEPTH_SPREAD", "DEPTH_SPREAD"),
         ("(misses and fit.rig)", "fit.rig"),
-        ("(self.is_known and not", "(True and not"),
+        ("fit.is_small and not signs.are_usual", "False"),
+        ("return not self.mistakes and (", "return ("),
+        ("self.distortion.likely <= LITTLE_DISTORTION", "self.distortion.k1 <= LITTLE_DISTORTION"),
         tests=(f"{UNIT}pose_refine.py",),
     ),
     *of(
@@ -469,6 +471,7 @@ MUTANTS = [
         "pose/lens.py",
         ("A[:, 0] = (ahead - behind)", "A[:, 0] = (behind - ahead)"),
         (", _error_by_blocks(inverse, pulls, blocks(tracks)))", ", 0.0)"),
+        ("abs(estimate) + LIKELY * error", "abs(estimate) - LIKELY * error"),
         tests=(f"{UNIT}pose_refine.py",),
     ),
     *of(
@@ -856,9 +859,11 @@ MUTANTS = [
         tests=("tests/integration/test_graphs.py",),
     ),
     *of(
-        "pose/refine.py",
+        "pose/fit.py",
         ("<= SURELY * fit.limit_px", "<= 9.0 * fit.limit_px"),
-        ("replace(fit, surely=surely_fits(greys) if", "replace(fit, surely=False if"),
+        ("replace(fit, surely=small().surely)", "fit"),
+        ("if greys.rig and (of_small", "if (of_small"),
+        ("(self.is_known and not", "(True and not"),
         tests=(f"{UNIT}pose_refine.py",),
     ),
     *of(

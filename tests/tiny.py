@@ -11,7 +11,8 @@ from diffusers.configuration_utils import ConfigMixin, register_to_config
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
 from geodiff_plugin import GeometryGuidance, enable_geometry_guidance
-from geodiff_plugin.pose.refine import CheckedViews, measure_fit, posed_greys, refine_views
+from geodiff_plugin.pose.fit import measure_fit, posed_greys
+from geodiff_plugin.pose.refine import CheckedViews, refine_views
 from geodiff_plugin.types import PosedViews
 
 SCHEDULER = {

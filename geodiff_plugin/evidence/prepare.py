@@ -23,15 +23,9 @@ from geodiff_plugin.matching import Matches, clean
 from geodiff_plugin.matching.matches import read_above
 from geodiff_plugin.matching.rows import RowMatches, RowPictures, match_rows, rectified_pictures
 from geodiff_plugin.messages import Message
+from geodiff_plugin.pose.fit import PoseFit, fit_of_small, measure_fit, posed_greys
 from geodiff_plugin.pose.mistakes import INVERSE
-from geodiff_plugin.pose.refine import (
-    PoseFit,
-    measure_fit,
-    posed_greys,
-    refine_views,
-    report_as_given,
-    surely_fits,
-)
+from geodiff_plugin.pose.refine import refine_views, report_as_given
 from geodiff_plugin.scale.points import RELIABLE, reliable_matches
 from geodiff_plugin.types import PosedViews
 
@@ -90,7 +84,7 @@ def _made_beside_check(
     with suppress(InputError):  # raised again below, unless a refined pose mends it
         evidence = prepare_evidence(clear, points, config)
     views = clear.views
-    if check.surely.result() or check.fit.result().fits:
+    if check.small.result().surely or check.fit.result().fits:
         fit = check.fit
         report = Beside(lambda: refine_views(clear, fit.result(), measured_baseline).report, left_01.device)
     else:
@@ -104,7 +98,7 @@ def _made_beside_check(
 class _Check(NamedTuple):
     """Whether poses fit, as the CPU works it out."""
 
-    surely: Beside[bool]  # ``surely_fits``, there first
+    small: Beside[PoseFit]  # ``fit_of_small``, there first
     fit: Beside[PoseFit]
 
 
@@ -112,8 +106,8 @@ def _check_beside(posed: PosedViews) -> _Check:
     """The check of views of which the left one, at least, is on the device."""
     device = posed.left_01.device
     greys = Beside(lambda: posed_greys(posed), device)
-    surely = Beside(lambda: surely_fits(greys.result()), device)
-    return _Check(surely, Beside(lambda: measure_fit(greys.result(), surely.result), device))
+    small = Beside(lambda: fit_of_small(greys.result()), device)
+    return _Check(small, Beside(lambda: measure_fit(greys.result(), small.result), device))
 
 
 def prepare_evidence(native: PosedViews, points: Tensor | None, config: GuidanceConfig) -> Evidence:

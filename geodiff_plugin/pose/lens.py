@@ -23,6 +23,8 @@ STEP_TURN = 1e-4
 MOST_K1 = 0.6
 #: Steps to the rays without a distortion, as many as OpenCV takes.
 STEPS_OF_RAYS = 5
+#: A distortion is unlikely to be larger than its estimate by more than so many standard errors.
+LIKELY = 2.0
 
 
 class _Pair(NamedTuple):
@@ -74,26 +76,29 @@ class Remaining(NamedTuple):
     """The radial coefficient k1, of OpenCV's model, that both pictures still have for certain.
 
     ``alone`` is what of it is certain too where the right camera may be turned, or its picture sheared or
-    stretched: what they explain as well is not known to be a distortion. 0 where nothing is certain, NaN for
-    too few matches.
+    stretched: what they explain as well is not known to be a distortion. 0 where nothing is certain.
+    ``likely`` is the largest size of k1 that is not unlikely. NaN for too few matches.
     """
 
     k1: float
     alone: float
+    likely: float
 
 
 def remaining_distortion(tracks: Tracks, T: np.ndarray) -> Remaining:
     """The distortion that matches of one right view show under ``T (4, 4)``, ``T_right_from_left``."""
     tracks = tracks.kept(np.abs(epipolar(tracks, T).off_px) < MOST_OFF_PX)
     if len(tracks) < FEWEST:
-        return Remaining(math.nan, math.nan)  # the one NaN, by which equal verdicts are equal
-    k1 = _certain_k1(tracks, T, np.zeros((len(tracks), 0)))
+        return Remaining(math.nan, math.nan, math.nan)  # the one NaN, by which equal verdicts are equal
+    estimate, error = _fit_k1(tracks, T, np.zeros((len(tracks), 0)))
+    k1, likely = certain_part(estimate, error), abs(estimate) + LIKELY * error
     if k1 == 0.0:
-        return Remaining(0.0, 0.0)
+        return Remaining(0.0, 0.0, likely)
     sheared = (tracks.right_px[0] - tracks.K_rights[0][:2, 2]) / tracks.K_rights[0][0, 0]
-    others = [_certain_k1(tracks, T, explained) for explained in (_by_rotation(tracks, T), sheared)]
+    explanations = _by_rotation(tracks, T), sheared
+    others = [certain_part(*_fit_k1(tracks, T, explained)) for explained in explanations]
     alone = min((k1, *others), key=abs) if all(other * k1 > 0 for other in others) else 0.0
-    return Remaining(k1, alone)
+    return Remaining(k1, alone, likely)
 
 
 def _by_rotation(tracks: Tracks, T: np.ndarray) -> np.ndarray:
@@ -107,14 +112,14 @@ def _by_rotation(tracks: Tracks, T: np.ndarray) -> np.ndarray:
     return np.stack(columns, axis=1)
 
 
-def _certain_k1(tracks: Tracks, T: np.ndarray, explained: np.ndarray) -> float:
-    """The k1 that is certain beside other explanations, columns ``(N, M)`` of the residuals.
+def _fit_k1(tracks: Tracks, T: np.ndarray, explained: np.ndarray) -> tuple[float, float]:
+    """k1 beside other explanations, columns ``(N, M)`` of the residuals, and its standard error.
 
     It minimises ``sum_i rho(e_i(k1) + c + b . a_i)``, with ``e_i`` the signed distance of match i from its
     epipolar line when ``k1`` is removed from both pictures, ``c`` a shift across the lines, ``a_i`` the
-    match's row of the other explanations, and Cauchy's ``rho``; the ``certain_part`` of the estimate counts.
-    Its standard error is the larger of two: as if matches erred independently, and as the sums over blocks of
-    the left image show, since neighbours err alike.
+    match's row of the other explanations, and Cauchy's ``rho``. The standard error is the larger of two: as
+    if matches erred independently, and as the sums over blocks of the left image show, since neighbours err
+    alike.
     """
     pair, k1, others = _pair(tracks, T), 0.0, np.zeros(explained.shape[1])
     # Derivatives of the residuals by k1, by the shift and by the others.
@@ -132,7 +137,7 @@ def _certain_k1(tracks: Tracks, T: np.ndarray, explained: np.ndarray) -> float:
         k1, others = float(np.clip(k1 - step[0], -MOST_K1, MOST_K1)), step[2:]
     inverse, pulls = np.linalg.inv(H), A * (weight * (off - A @ step))[:, None]
     error = max(scale * float(np.sqrt(inverse[0, 0])), _error_by_blocks(inverse, pulls, blocks(tracks)))
-    return certain_part(k1, error)
+    return k1, error
 
 
 def _error_by_blocks(inverse: np.ndarray, pulls: np.ndarray, block: np.ndarray) -> float:

@@ -12,10 +12,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.tracks import (
     Projected,
@@ -228,12 +226,6 @@ def solve_poses(
         if converged:
             break
     return Ts
-
-
-def is_rig(tracks: Tracks, given: np.ndarray) -> bool:
-    """Whether all poses as given ``(V, 4, 4)`` are those of a rectified rig."""
-    cameras = (torch.as_tensor(m, device="cpu") for m in (tracks.K_left, tracks.K_rights, given))
-    return bool(is_rectified(*cameras).all())
 
 
 def nearby_poses(sparse: Tracks, given: np.ndarray, before: np.ndarray) -> np.ndarray:

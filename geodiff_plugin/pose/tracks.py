@@ -347,8 +347,8 @@ def match_features(left: tuple[np.ndarray, np.ndarray], right: tuple[np.ndarray,
     """Indices ``(M, 2)`` of features that are each other's nearest and pass the ratio test from the left."""
     if min(len(left[0]), len(right[0])) < 2:
         return np.zeros((0, 2), int)
-    # Unit vectors: distance^2 = 2 - 2 alike. The product is torch's, because after one of NumPy the threads of
-    # its BLAS keep all cores busy for a tenth of a second, waiting for another.
+    # Unit vectors: distance^2 = 2 - 2 alike. The product is torch's, because after one of NumPy the threads
+    # of its BLAS keep all cores busy for a tenth of a second, waiting for another.
     alike = (torch.from_numpy(left[1]) @ torch.from_numpy(right[1]).T).numpy()
     rows = np.arange(len(alike))
     best = alike.argmax(1)

@@ -54,7 +54,7 @@ BUDGET_S, GRACE_S = 210, 60
 STAGES = (
     "GeometryGuidance.evidence_of",
     "  clean",
-    "  surely_fits",
+    "  fit_of_small",
     "  measure_fit",
     "  refine_views",
     "  build_cost_volume",

@@ -21,6 +21,7 @@ PAIR = read_demo_pair()
 #: Where float64 is asked for: cameras and poses, in tensors that are made on the CPU and stay there.
 ON_THE_CPU = {
     "matching/alignment.py",
+    "pose/fit.py",
     "pose/refine.py",
     "pose/tracks.py",
     "pose/solve.py",

@@ -14,15 +14,19 @@ from scipy.spatial.transform import Rotation
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin._threads import Beside
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
+from geodiff_plugin.evidence import prepare as prepare_module
 from geodiff_plugin.evidence.evidence import Evidence
+from geodiff_plugin.geometry import is_rectified
 from geodiff_plugin.matching.planes import Parallax
+from geodiff_plugin.messages import Message
+from geodiff_plugin.pose import fit as fit_module
 from geodiff_plugin.pose import refine
 from geodiff_plugin.pose import tracks as tracks_module
 from geodiff_plugin.pose.lens import remaining_distortion, undistorted_rays
 from geodiff_plugin.pose.mistakes import _undone, exchangeable, find_mistake
 from geodiff_plugin.pose.moving import moved_share
 from geodiff_plugin.pose.refine import depths_apart, fit_displacement, straightened
-from geodiff_plugin.pose.solve import PosePrior, is_rig, regularised_poses, solve_poses
+from geodiff_plugin.pose.solve import PosePrior, regularised_poses, solve_poses
 from geodiff_plugin.pose.tracks import (
     Tracks,
     _dense_matches,
@@ -35,6 +39,7 @@ from geodiff_plugin.pose.tracks import (
     solve_inverse_depth,
     sparse_tracks,
 )
+from geodiff_plugin.result import misfit, verdict
 from geodiff_plugin.result.indicators import indicators_of
 from geodiff_plugin.types import CameraView, PosedViews
 from tests.scenes import render_pair
@@ -126,7 +131,8 @@ def test_a_perturbed_pose_comes_back_but_for_what_the_views_cannot_tell() -> Non
 
 
 def regularised(tracks: Tracks, given: np.ndarray) -> np.ndarray:
-    before, rig = median_residuals(tracks, given), is_rig(tracks, given)
+    cameras = (torch.from_numpy(each) for each in (tracks.K_left, tracks.K_rights, given))
+    before, rig = median_residuals(tracks, given), bool(is_rectified(*cameras).all())
     return regularised_poses(tracks, given, given, before, rig)[0]
 
 
@@ -350,8 +356,10 @@ def test_distortion_of_both_pictures_is_measured(k1: float, E: np.ndarray) -> No
         return 500.0 * x * (1.0 + k1 * (x**2).sum(-1, keepdims=True)) + K[:2, 2]
 
     bent = replace(tracks, left_px=distorted(tracks.left_px), right_px=distorted(tracks.right_px))
-    found, alone = remaining_distortion(bent, Ts[0])
+    found, alone, likely = remaining_distortion(bent, Ts[0])
     assert found == pytest.approx(k1, abs=0.03) and abs(found) <= abs(k1) + 0.005
+    assert abs(k1) < likely < abs(k1) + 0.03
+    assert remaining_distortion(bent.kept(slice(100)), Ts[0]).likely > likely, "fewer matches exclude less"
     assert alone == pytest.approx(k1, abs=0.06) and abs(alone) <= abs(found)
     assert np.isnan(remaining_distortion(bent.kept(slice(39)), Ts[0])).all()
 
@@ -510,7 +518,9 @@ def plain():
 
 def test_where_features_are_few_optical_flow_shows_whether_a_pose_fits(plain) -> None:
     right, wrong = plain.E.numpy(), plain.E.numpy() @ pose((1.0, -0.5, 0.5), (0, 0, 0))
-    assert not refine.measure_fit(refine.posed_greys(posed(plain, right))).is_known, "else nothing is tested"
+    assert not fit_module.measure_fit(fit_module.posed_greys(posed(plain, right))).is_known, (
+        "else nothing is tested"
+    )
     given = posed(plain, right)
     used, report = checked_views(given)
     assert used == given.views and not report.warnings
@@ -526,7 +536,7 @@ def test_a_calibration_is_not_changed_for_what_flow_alone_shows() -> None:
     assert checked_views(posed(pair, pair.E.numpy())).report.status == "fits"
     raised = replace(pair, right=replace(pair.right, image_01=torch.roll(pair.right.image_01, 2, dims=-2)))
     given = posed(raised, pair.E.numpy())
-    assert not refine.measure_fit(refine.posed_greys(given)).is_known, "else nothing is tested"
+    assert not fit_module.measure_fit(fit_module.posed_greys(given)).is_known, "else nothing is tested"
     used, report = checked_views(given)
     assert report.status == "not checked" and used == given.views and report.residual_px[0] > 0.45
 
@@ -569,7 +579,7 @@ def check_beside_matching(monkeypatch) -> None:
 
 def hold_until(asked: threading.Event, name: str, monkeypatch) -> None:
     """Let a function of the check wait for the event where evidence is made."""
-    function = getattr(refine, name)
+    function = getattr(prepare_module, name)
 
     def patient(*args):
         assert asked.wait(60)
@@ -611,8 +621,8 @@ def test_flow_is_asked_about_few_features_beside_the_matching_as_well(pair, monk
     left, right = pair.left.image_01.float(), pair.right.image_01.float()
     guidance = GeometryGuidance(right, (pair.K_left.numpy(), pair.K_right.numpy()), E)
     posed = guidance.inputs[0].beside(left)
-    count = int(refine.measure_fit(refine.posed_greys(posed), lambda: False).tracks.seen.sum())
-    for module in (refine, tracks_module):
+    count = int(fit_module.measure_fit(fit_module.posed_greys(posed)).tracks.seen.sum())
+    for module in (fit_module, refine, tracks_module):
         monkeypatch.setattr(module, "FEWEST", count + 1)
     (alone,) = guidance.prepare(left[None])
     check_beside_matching(monkeypatch)
@@ -661,26 +671,79 @@ def test_small_pictures_that_show_that_poses_fit_are_enough(monkeypatch) -> None
 
 @pytest.mark.parametrize(("turn_deg", "fits"), [(0.0, True), (0.1, False), (2.0, False)])
 def test_small_pictures_say_surely_only_of_poses_that_fit(turn_deg: float, fits: bool) -> None:
-    greys = refine.posed_greys(demo_views(turn_deg))
-    assert refine.surely_fits(greys) is fits
-    few = greys._replace(views=[(np.full_like(grey, 90), K) for grey, K in greys.views])
-    assert not refine.surely_fits(few)
+    greys = fit_module.posed_greys(demo_views(turn_deg))
+    assert fit_module.fit_of_small(greys).surely is fits
+    few = replace(greys, views=[(np.full_like(grey, 90), K) for grey, K in greys.views])
+    assert not fit_module.fit_of_small(few).surely
 
 
-def test_one_answer_holds_where_small_and_whole_pictures_differ(monkeypatch) -> None:
+@pytest.mark.parametrize("rig", [True, False])
+def test_one_answer_holds_where_small_and_whole_pictures_differ(rig: bool, monkeypatch) -> None:
     """On CUDA what comes first decides; elsewhere the same has to come out."""
-    monkeypatch.setattr(refine, "FITS_PX", 1e-3)
+    for name in ("FITS_PX", "POSED_FITS_PX"):
+        monkeypatch.setattr(fit_module, name, 1e-3)
+    monkeypatch.setattr(fit_module.PosedGreys, "rig", rig)
     posed = demo_views()
-    greys = refine.posed_greys(posed)
-    asked = []
+    greys = fit_module.posed_greys(posed)
+    small = fit_module.fit_of_small(greys)
+    assert not small.surely
     for surely in (False, True):
-        fit = refine.measure_fit(greys, lambda answer=surely: asked.append(answer) or answer)
+        fit = fit_module.measure_fit(greys, lambda answer=surely: replace(small, surely=answer))
         assert fit.fits is surely and (fit.residual_px > fit.limit_px).all()
-    assert asked == [False, True]
+        assert fit.is_small is (surely and rig)
     views, report = refine.refine_views(posed, fit)
     assert views is posed.views and report.status == "fits"
-    monkeypatch.setattr(refine, "surely_fits", lambda _: True)
-    assert refine.measure_fit(greys).fits
+    monkeypatch.setattr(fit_module, "SURELY", 1e9)
+    assert fit_module.measure_fit(greys).fits
+
+
+def test_small_pictures_of_a_rig_say_all_where_they_exclude_what_is_unusual(monkeypatch) -> None:
+    posed = demo_views()
+    greys = fit_module.posed_greys(posed)
+    fit = fit_module.measure_fit(greys)
+    assert fit.is_small and fit.rig
+    whole = fit.of_whole_pictures()
+    assert not whole.is_small and len(whole.tracks) > 2 * len(fit.tracks)
+    few, many = (len(each.tracks) for each in (fit, whole))
+    assert refine.refine_views(posed, fit).report.matches == (few,)
+    for name in ("LITTLE_BEHIND", "LITTLE_DISTORTION", "LITTLE_MOVED", "LITTLE_EXCHANGED"):
+        with monkeypatch.context() as patched:
+            patched.setattr(refine, name, -1.0)
+            assert refine.refine_views(posed, fit).report.matches == (many,), name
+    mistake = Message("camera.other-centre", "Something is wrong.")
+    found = iter([(mistake,), ()])
+    monkeypatch.setattr(refine, "_messages", lambda *_: next(found))
+    views, report = refine.refine_views(posed, fit)
+    assert report.matches == (many,) and not report.warnings and views is posed.views
+
+
+def test_few_features_do_not_hide_what_features_at_full_size_show() -> None:
+    """Distortion that few matches show, but not for certain, is looked for in more of them."""
+    shown = demo_views()
+    K_left = shown.K_left.double().numpy()
+
+    def distorted(image: torch.Tensor) -> torch.Tensor:
+        v, u = np.indices(image.shape[1:], dtype=np.float64)
+        bent_px, lens = np.stack([u, v], -1).reshape(-1, 1, 2), np.array([-0.12, 0, 0, 0])
+        px = cv2.undistortPoints(bent_px, K_left, lens, P=K_left).reshape(*u.shape, 2).astype(np.float32)
+        made = cv2.remap(image.permute(1, 2, 0).numpy(), px, None, cv2.INTER_LINEAR)
+        return torch.from_numpy(made).permute(2, 0, 1)
+
+    (view,) = shown.views
+    bent = shown._replace(
+        left_01=distorted(shown.left_01), views=(view._replace(image_01=distorted(view.image_01)),)
+    )
+    fit = fit_module.measure_fit(fit_module.posed_greys(bent))
+    report = refine.refine_views(bent, fit).report
+    of_small = len(fit_module.fit_of_small(fit.greys).tracks)
+    assert report.distortion < -0.05 and report.matches[0] > 1.5 * of_small
+
+
+def test_small_pictures_must_exclude_twice_what_a_result_makes_anything_of() -> None:
+    assert min(misfit.USUAL_BEHIND, verdict.MOST_BEHIND) >= 2.0 * refine.LITTLE_BEHIND
+    assert min(misfit.USUAL_DISTORTION, verdict.MOST_DISTORTION) >= refine.LITTLE_DISTORTION
+    assert 2.0 * refine.LITTLE_MOVED <= verdict.MOST_MOVED
+    assert 2.0 * refine.LITTLE_EXCHANGED <= verdict.EXCHANGEABLE
 
 
 def test_matches_of_small_pictures_are_in_pixels_of_the_whole_ones() -> None:
@@ -720,16 +783,16 @@ def test_a_calibrated_rig_keeps_its_calibration_where_all_matches_fit_it(monkeyp
     T = torch.from_numpy(np.linalg.inv(rig.E.numpy())).float()
     views = (CameraView(rig.right.image_01.float(), rig.K_right.float(), T),)
     given = PosedViews(rig.left.image_01.float(), views, rig.K_left.float())
-    sparse_tracks = refine.sparse_tracks
+    sparse_tracks = fit_module.sparse_tracks
 
     def missing(*images):
         sparse = sparse_tracks(*images)
         return replace(sparse, right_px=sparse.right_px + np.array([0.0, 0.6]))
 
-    monkeypatch.setattr(refine, "sparse_tracks", missing)
+    monkeypatch.setattr(fit_module, "sparse_tracks", missing)
     used, report = checked_views(given)
     assert report.status == "fits" and used[0] is views[0]
-    assert report.residual_px_given[0] < refine.FITS_PX and not report.warnings
+    assert report.residual_px_given[0] < fit_module.FITS_PX and not report.warnings
 
 
 def test_a_rig_is_not_told_that_another_pose_fits_as_well(monkeypatch) -> None:
