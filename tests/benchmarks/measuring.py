@@ -53,11 +53,13 @@ class Cost:
 
     Attributes:
         milliseconds: the median of several calls.
+        fastest_ms: the least of them, which says more where other work slows the host down now and then.
         peak_bytes: most memory, as ``PeakMemory`` counts it.
         traced: on CUDA only.
     """
 
     milliseconds: float
+    fastest_ms: float
     peak_bytes: int
     traced: Traced | None
 
@@ -117,7 +119,8 @@ def costs(
             with PeakMemory(device) as memory:
                 call()
             seen = traced(call) if device.type == "cuda" else None
-            found[name] = Cost(1e3 * statistics.median(taken[name]), memory.peak_bytes, seen)
+            times = [1e3 * seconds for seconds in taken[name]]
+            found[name] = Cost(statistics.median(times), min(times), memory.peak_bytes, seen)
     return found
 
 

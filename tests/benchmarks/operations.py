@@ -109,14 +109,17 @@ def call_of(way: str, pipe: Any, size: Size, folder: str) -> Callable[[], Any]:
 
 @contextmanager
 def _counted(networks: Sequence[tuple[Any, str, str]], calls: Counter[str]) -> Iterator[None]:
-    """Count calls of ``(network, method, kind)``, those that a gradient goes back through apart."""
+    """Count calls of ``(network, method, kind)``, those that a gradient goes back through apart.
+
+    A batch counts as so many calls, because it has so many times the operations.
+    """
 
     def counting(own: Callable[..., Any], kind: str) -> Callable[..., Any]:
         def counted(*args: Any, **kwargs: Any) -> Any:
             result = own(*args, **kwargs)
             first = result[0] if isinstance(result, tuple) else next(iter(result.values()))
             goes_back = isinstance(first, torch.Tensor) and first.requires_grad
-            calls[kind + (" + back" if goes_back else "")] += 1
+            calls[kind + (" + back" if goes_back else "")] += len(args[0])
             return result
 
         return counted
