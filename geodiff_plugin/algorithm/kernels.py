@@ -291,7 +291,7 @@ def _parts_of_direction(work, area, p, n, step):
 def _direction_tile(system, work, partial, step, tile, tiles, count, p, n, width, stride, area):
     """The direction of a step in a tile, its image under the matrix, and the sum of their product.
 
-    All pixels are read before the sums, which make threads wait for each other: so both waits are one.
+    All pixels are read before the sums, at which threads wait for each other, so that they wait but once.
     """
     inside = p < n
     diagonal, to_left, to_right, to_upper, to_lower = _row_of_matrix(system, p, n, width, stride)

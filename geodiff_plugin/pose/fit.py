@@ -1,7 +1,7 @@
 """How the poses of right views as given fit the matches of their pictures' features.
 
-Features of pictures of half the size take a quarter of the time. They are fewer, and less exact, so they only
-ever say that a pose fits. Of a rectified rig they are enough to know that all else is as usual.
+Features of pictures of half the size take a quarter of the time. They are fewer and less exact, so they can
+show that a pose fits, and never that it does not. Of a rectified rig they are often all that the check needs.
 """
 
 from __future__ import annotations

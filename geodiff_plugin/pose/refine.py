@@ -56,15 +56,16 @@ DEPTH_SPREAD = 0.05
 #: A pose is undetermined if the one that fits best changes log depth by more than this in the median. That
 #: was up to .148 for right pairs, and .17 to .64 where the yaw of E was off by a degree.
 MOST_DEPTH_SPREAD = 0.16
-#: Features of small pictures are enough up to this share of matches behind infinity, half of what any result
-#: makes something of, as are the next three.
+#: Features of small pictures are enough where they show at most this share of matches behind infinity: half
+#: of the share from which confidence falls.
 LITTLE_BEHIND = 0.02
-#: Up to this distortion k1, in size, that is not unlikely: as much as right pairs seem to have. Of 236 right
-#: and wrong calibrations of rigs 149 passed, whose pictures at full size show .05 at most.
+#: Where a larger k1 than this is unlikely: right pairs seem to have as much. Of 236 right and wrong
+#: calibrations of rigs 149 passed, and for those features at full size showed .05 at most.
 LITTLE_DISTORTION = 0.08
-#: Up to this share of matches in parts that moved.
+#: Where at most this share of matches lies in parts that moved: half of the share that is not trusted.
 LITTLE_MOVED = 0.075
-#: Up to this share of matches that fit as well with near and far exchanged.
+#: Where at most this share of matches fits as well with near and far exchanged: half of the share from which
+#: the order of the pictures is in doubt.
 LITTLE_EXCHANGED = 0.15
 # Straightening: residual above which a match counts for less, pixels.
 _BENT_PX = 0.5
@@ -196,7 +197,7 @@ class _Signs(NamedTuple):
 
     @property
     def are_usual(self) -> bool:
-        """Whether even few matches exclude all of it; what is unknown is not excluded."""
+        """Whether even few matches exclude everything unusual; what is unknown is not excluded."""
         return not self.mistakes and (
             self.behind.share <= LITTLE_BEHIND
             and self.distortion.likely <= LITTLE_DISTORTION
