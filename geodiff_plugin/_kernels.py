@@ -21,7 +21,8 @@ import torch
 #: A kernel that every guided call with a second view launches, by its name in Triton's cache.
 ALWAYS_LAUNCHED = "paths_kernel"
 _switched_on: ContextVar[bool] = ContextVar("geodiff_kernels", default=True)
-#: Triton's caches that hold compiled kernels: looking through one takes milliseconds, so it is done once.
+#: Triton's caches that are known to hold compiled kernels. To look into one takes milliseconds, in which a
+#: GPU would wait at every call.
 _FILLED = set[Path]()
 
 

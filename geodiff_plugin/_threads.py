@@ -114,8 +114,8 @@ class Beside(Generic[T]):
             self._answer = _threads_beside(os.getpid()).submit(work)
             return
         self._answer = _in_new_thread(work)
-        # The thread has Python's lock once it has begun. The caller, who will need its answer, would
-        # otherwise keep the lock for milliseconds before the thread can ask anything of the device.
+        # To start the thread is not enough: the caller would keep Python's lock, for up to five milliseconds,
+        # while the thread, whose answer it needs soon, could not ask anything of the device.
         begun.wait()
 
     @classmethod

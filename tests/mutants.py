@@ -420,7 +420,7 @@ MUTANTS = [
         ("(misses and fit.rig)", "fit.rig"),
         ("fit.is_small and not signs.are_usual", "False"),
         ("return not self.mistakes and (", "return ("),
-        ("self.distortion.likely <= LITTLE_DISTORTION", "self.distortion.k1 <= LITTLE_DISTORTION"),
+        ("self.distortion.likely <= LITTLE_DISTORTION", "abs(self.distortion.k1) <= LITTLE_DISTORTION"),
         tests=(f"{UNIT}pose_refine.py",),
     ),
     *of(
@@ -471,7 +471,7 @@ MUTANTS = [
         "pose/lens.py",
         ("A[:, 0] = (ahead - behind)", "A[:, 0] = (behind - ahead)"),
         (", _error_by_blocks(inverse, pulls, blocks(tracks)))", ", 0.0)"),
-        ("abs(estimate) + LIKELY * error", "abs(estimate) - LIKELY * error"),
+        ("abs(estimate) + BOUND_ERRORS * error", "abs(estimate) - BOUND_ERRORS * error"),
         tests=(f"{UNIT}pose_refine.py",),
     ),
     *of(
@@ -862,7 +862,8 @@ MUTANTS = [
         "pose/fit.py",
         ("<= SURELY * fit.limit_px", "<= 9.0 * fit.limit_px"),
         ("replace(fit, surely=small().surely)", "fit"),
-        ("if greys.rig and (of_small", "if (of_small"),
+        ("if greys.rig and len", "if len"),
+        ("len(greys.given) == 1 and (of_small", "(of_small"),
         ("(self.is_known and not", "(True and not"),
         tests=(f"{UNIT}pose_refine.py",),
     ),

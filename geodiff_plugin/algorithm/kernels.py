@@ -291,7 +291,8 @@ def _parts_of_direction(work, area, p, n, step):
 def _direction_tile(system, work, partial, step, tile, tiles, count, p, n, width, stride, area):
     """The direction of a step in a tile, its image under the matrix, and the sum of their product.
 
-    All pixels are read before the sums, at which threads wait for each other, so that they wait but once.
+    All pixels are read before the sums. Threads wait for each other at a sum, and would wait for memory again
+    after it.
     """
     inside = p < n
     diagonal, to_left, to_right, to_upper, to_lower = _row_of_matrix(system, p, n, width, stride)
@@ -317,7 +318,10 @@ def _direction_tile(system, work, partial, step, tile, tiles, count, p, n, width
 
 @triton.jit
 def _update_tile(x, work, partial, step, tile, tiles, count, p, n, area):
-    """Iterate and residual of a tile after the step along its direction, and the residual's sum."""
+    """Iterate and residual of a tile after the step along its direction, and the residual's sum.
+
+    Pixels are read before the sums, as by ``_direction_tile``.
+    """
     inside = p < n
     moved, direction = _value_at(x, p, n), _value_at(work + (4 + step % 2) * area, p, n)
     rest, image = _value_at(work, p, n), _value_at(work + 2 * area, p, n)

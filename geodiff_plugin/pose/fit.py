@@ -1,7 +1,7 @@
 """How the poses of right views as given fit the matches of their pictures' features.
 
 Features of pictures of half the size take a quarter of the time. They are fewer and less exact, so they can
-show that a pose fits, and never that it does not. Of a rectified rig they are often all that the check needs.
+show that a pose fits, and never that it does not. The check of a rectified pair often needs no others.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ FITS_PX = 0.45
 POSED_FITS_PX = 0.3
 #: Scale of the pictures in which features show most poses that fit at once.
 SMALLER = 0.5
-#: There a pose fits up to this share of the residual. Of 151 real pairs, each under its own and 119 other
-#: poses, none was then taken for one that fits whose matches at full size miss by more than they may.
+#: There a pose surely fits up to this share of the limit. Of 151 real pairs, each under its own pose and 119
+#: others, none passed that misses the limit at full size.
 SURELY = 0.85
 
 
@@ -47,7 +47,7 @@ class PosedGreys:
     given: np.ndarray  # (V, 4, 4) T_right_from_left
     heights: Sequence[int]  # of the pictures that the views were made of
 
-    @property
+    @functools.cached_property
     def rig(self) -> bool:
         """Whether all poses are those of a rectified rig."""
         K_left, *K_rights = (torch.from_numpy(K) for _, K in self.views)
@@ -121,12 +121,12 @@ def fit_of_small(greys: PosedGreys) -> PoseFit:
 def measure_fit(greys: PosedGreys, small: Callable[[], PoseFit] | None = None) -> PoseFit:
     """Match the pictures, and measure how far the matches are from their epipolar lines.
 
-    Of a rectified rig whose poses surely fit, the answer is that of small pictures. ``small`` gives the
+    Of a rectified pair whose pose surely fits, the answer is that of small pictures. ``small`` gives the
     answer of ``fit_of_small`` where another thread works it out.
     """
     small = small or functools.cache(functools.partial(fit_of_small, greys))
-    _ = greys.signs  # now, while threads look for features
-    if greys.rig and (of_small := small()).surely:
+    _ = greys.signs  # on CUDA another thread looks for features meanwhile; ``refine_views`` reads them later
+    if greys.rig and len(greys.given) == 1 and (of_small := small()).surely:
         return of_small
     fit = _fit_at(greys, 1.0)
     return fit if fit.fits else replace(fit, surely=small().surely)

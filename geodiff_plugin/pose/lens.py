@@ -23,8 +23,8 @@ STEP_TURN = 1e-4
 MOST_K1 = 0.6
 #: Steps to the rays without a distortion, as many as OpenCV takes.
 STEPS_OF_RAYS = 5
-#: A distortion is unlikely to be larger than its estimate by more than so many standard errors.
-LIKELY = 2.0
+#: So many standard errors above its estimate lies the bound of a distortion's size.
+BOUND_ERRORS = 2.0
 
 
 class _Pair(NamedTuple):
@@ -77,7 +77,7 @@ class Remaining(NamedTuple):
 
     ``alone`` is what of it is certain too where the right camera may be turned, or its picture sheared or
     stretched: what they explain as well is not known to be a distortion. 0 where nothing is certain.
-    ``likely`` is the largest size of k1 that is not unlikely. NaN for too few matches.
+    ``likely`` is an upper bound of k1's size. All three are NaN for too few matches.
     """
 
     k1: float
@@ -91,7 +91,7 @@ def remaining_distortion(tracks: Tracks, T: np.ndarray) -> Remaining:
     if len(tracks) < FEWEST:
         return Remaining(math.nan, math.nan, math.nan)  # the one NaN, by which equal verdicts are equal
     estimate, error = _fit_k1(tracks, T, np.zeros((len(tracks), 0)))
-    k1, likely = certain_part(estimate, error), abs(estimate) + LIKELY * error
+    k1, likely = certain_part(estimate, error), abs(estimate) + BOUND_ERRORS * error
     if k1 == 0.0:
         return Remaining(0.0, 0.0, likely)
     sheared = (tracks.right_px[0] - tracks.K_rights[0][:2, 2]) / tracks.K_rights[0][0, 0]

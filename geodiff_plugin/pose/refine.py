@@ -56,16 +56,17 @@ DEPTH_SPREAD = 0.05
 #: A pose is undetermined if the one that fits best changes log depth by more than this in the median. That
 #: was up to .148 for right pairs, and .17 to .64 where the yaw of E was off by a degree.
 MOST_DEPTH_SPREAD = 0.16
-#: Features of small pictures are enough where they show at most this share of matches behind infinity: half
-#: of the share from which confidence falls.
+#: Features of small pictures are enough only if at most this share of them lies behind infinity, half of the
+#: share from which confidence falls.
 LITTLE_BEHIND = 0.02
-#: Where a larger k1 than this is unlikely: right pairs seem to have as much. Of 236 right and wrong
-#: calibrations of rigs 149 passed, and for those features at full size showed .05 at most.
+#: They are enough only if the size of k1 is probably at most this, as right pairs show up to this much. Of
+#: 236 rigs, right or wrong in one of six ways, 149 passed, whose features at full size showed .05 at most.
 LITTLE_DISTORTION = 0.08
-#: Where at most this share of matches lies in parts that moved: half of the share that is not trusted.
+#: They are enough only if at most this share of them lies in parts that moved, half of the share that is not
+#: trusted.
 LITTLE_MOVED = 0.075
-#: Where at most this share of matches fits as well with near and far exchanged: half of the share from which
-#: the order of the pictures is in doubt.
+#: They are enough only if at most this share of them fits as well with near and far exchanged, half of the
+#: share from which the order of the pictures is in doubt.
 LITTLE_EXCHANGED = 0.15
 # Straightening: residual above which a match counts for less, pixels.
 _BENT_PX = 0.5
@@ -123,8 +124,8 @@ def refine_views(posed: PosedViews, fit: PoseFit, measured: bool = False) -> Che
     ``measured`` baselines keep their lengths, as those of a rectified rig do; others are weighed against the
     depth of the scene. The given views are returned if they fit, if there are too few matches, if a mistake
     explains the misfit, or if no better pose is near. A rectified rig is refined only if the dense matches
-    miss it as well. Where few features match, optical flow is asked. Where the features of small pictures
-    show that the poses of a rig fit, but do not exclude all else, those of the pictures themselves are.
+    miss it as well. Where few features match, optical flow is asked. If features of small pictures show that
+    the pose of a rig fits, but not that nothing else is wrong, those at full size are matched.
     """
     if not (fit.is_known or fit.surely):
         return _checked_by_flow(posed, fit, measured)
@@ -197,7 +198,7 @@ class _Signs(NamedTuple):
 
     @property
     def are_usual(self) -> bool:
-        """Whether even few matches exclude everything unusual; what is unknown is not excluded."""
+        """Whether the few matches of one small pair exclude every other fault; an unknown sign does not."""
         return not self.mistakes and (
             self.behind.share <= LITTLE_BEHIND
             and self.distortion.likely <= LITTLE_DISTORTION

@@ -200,8 +200,8 @@ class Bench:
 def _row_of(name: str, cost: Cost, plain: Cost | None) -> Row:
     row: Row = {"way": name, "ms": round(cost.milliseconds, 2)}
     row["x plain"] = None if plain is None else round(cost.milliseconds / plain.milliseconds, 2)
-    row["fastest"] = round(cost.fastest_ms, 2)
-    row["x plain's"] = None if plain is None else round(cost.fastest_ms / plain.fastest_ms, 2)
+    row["fastest, ms"] = round(cost.fastest_ms, 2)
+    row["fastest x plain"] = None if plain is None else round(cost.fastest_ms / plain.fastest_ms, 2)
     row["peak MB"] = round(cost.peak_bytes / 1e6)
     is_known = plain is not None and plain.peak_bytes > 0  # a short call on a CPU has no sample of it
     row["x plain's MB"] = round(cost.peak_bytes / plain.peak_bytes, 2) if is_known else None

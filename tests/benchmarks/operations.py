@@ -111,7 +111,7 @@ def call_of(way: str, pipe: Any, size: Size, folder: str) -> Callable[[], Any]:
 def _counted(networks: Sequence[tuple[Any, str, str]], calls: Counter[str]) -> Iterator[None]:
     """Count calls of ``(network, method, kind)``, those that a gradient goes back through apart.
 
-    A batch counts as so many calls, because it has so many times the operations.
+    A batch of n counts as n calls, because it takes n times the operations.
     """
 
     def counting(own: Callable[..., Any], kind: str) -> Callable[..., Any]:
