@@ -112,13 +112,14 @@ def finish(
     K = resize_intrinsics(native.K_left[None], native.size, image_size(depth_m))
     uncertainty = None if uncertainty is None else uncertainty.to(depth_m)
     refined = refine(evidence, members, depth_m, left_01, options.config) if options.config.crisp else None
-    prior_error, confidence = _error_of(members), None
+    prior_error, confidence, support = _error_of(members), None, None
     if refined is not None:
         depth_m = refined.depth_m.clamp(max=_farthest_m(evidence, options.config))
         if uncertainty is not None:
             uncertainty = _spread_of_members(evidence, members, depth_m, left_01, options)
         spread = None if uncertainty is None else uncertainty / depth_m
-        confidence = depth_confidence(refined.grounds, spread, prior_error)
+        confidence, support = depth_confidence(refined.grounds, spread, prior_error), refined.support
+        del refined  # maps of the size of the image, which large ones need room for
     visible, error = reprojection(native.views, depth_m, left_01, K) if native.views else (None, None)
     relative = median(joined([member.relative for member in members]), 0)[None]
     measured = _Measured(depth_m, relative, confidence, _over_prior(members, depth_m), visible)
@@ -140,7 +141,7 @@ def finish(
         visible=visible,
         photometric_error=error,
         confidence=confidence,
-        support=None if refined is None else refined.support,
+        support=support,
         prior_error=prior_error,
         over_prior=measured.over_prior,
     )
