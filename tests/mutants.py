@@ -420,7 +420,7 @@ MUTANTS = [
         ("(misses and fit.rig)", "fit.rig"),
         ("fit.is_small and not signs.are_usual", "False"),
         ("return not self.mistakes and (", "return ("),
-        ("self.distortion.likely <= LITTLE_DISTORTION", "abs(self.distortion.k1) <= LITTLE_DISTORTION"),
+        ("self.distortion.at_most <= LITTLE_DISTORTION", "abs(self.distortion.k1) <= LITTLE_DISTORTION"),
         tests=(f"{UNIT}pose_refine.py",),
     ),
     *of(

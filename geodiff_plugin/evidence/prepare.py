@@ -107,7 +107,12 @@ def _check_beside(posed: PosedViews) -> _Check:
     device = posed.left_01.device
     greys = Beside(lambda: posed_greys(posed), device)
     small = Beside(lambda: fit_of_small(greys.result()), device)
-    return _Check(small, Beside(lambda: measure_fit(greys.result(), small.result), device))
+
+    def fit() -> PoseFit:
+        _ = greys.result().signs  # while another thread looks for features; ``refine_views`` reads them later
+        return measure_fit(greys.result(), small.result)
+
+    return _Check(small, Beside(fit, device))
 
 
 def prepare_evidence(native: PosedViews, points: Tensor | None, config: GuidanceConfig) -> Evidence:

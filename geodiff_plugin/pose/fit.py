@@ -78,9 +78,13 @@ class PoseFit:
     greys: PosedGreys
     tracks: Tracks  # by SIFT
     residual_px: np.ndarray  # (V,) median distance of matches from their epipolar lines, NaN where too few
-    rig: bool  # a rectified one
     is_small: bool = False  # whether the features are those of small pictures
     surely: bool = False  # whether small pictures show that all poses fit
+
+    @property
+    def rig(self) -> bool:
+        """Whether all poses are those of a rectified rig."""
+        return self.greys.rig
 
     @property
     def is_known(self) -> bool:
@@ -105,7 +109,7 @@ class PoseFit:
 def _fit_at(greys: PosedGreys, scale: float) -> PoseFit:
     """How the poses fit features of pictures of a scale."""
     tracks = sparse_tracks(greys.views, scale)
-    return PoseFit(greys, tracks, median_residuals(tracks, greys.given), greys.rig, is_small=scale < 1.0)
+    return PoseFit(greys, tracks, median_residuals(tracks, greys.given), is_small=scale < 1.0)
 
 
 def fit_of_small(greys: PosedGreys) -> PoseFit:
@@ -125,7 +129,6 @@ def measure_fit(greys: PosedGreys, small: Callable[[], PoseFit] | None = None) -
     answer of ``fit_of_small`` where another thread works it out.
     """
     small = small or functools.cache(functools.partial(fit_of_small, greys))
-    _ = greys.signs  # on CUDA another thread looks for features meanwhile; ``refine_views`` reads them later
     if greys.rig and len(greys.given) == 1 and (of_small := small()).surely:
         return of_small
     fit = _fit_at(greys, 1.0)

@@ -77,12 +77,12 @@ class Remaining(NamedTuple):
 
     ``alone`` is what of it is certain too where the right camera may be turned, or its picture sheared or
     stretched: what they explain as well is not known to be a distortion. 0 where nothing is certain.
-    ``likely`` is an upper bound of k1's size. All three are NaN for too few matches.
+    ``at_most`` is an upper bound of k1's size. All three are NaN for too few matches.
     """
 
     k1: float
     alone: float
-    likely: float
+    at_most: float
 
 
 def remaining_distortion(tracks: Tracks, T: np.ndarray) -> Remaining:
@@ -91,14 +91,14 @@ def remaining_distortion(tracks: Tracks, T: np.ndarray) -> Remaining:
     if len(tracks) < FEWEST:
         return Remaining(math.nan, math.nan, math.nan)  # the one NaN, by which equal verdicts are equal
     estimate, error = _fit_k1(tracks, T, np.zeros((len(tracks), 0)))
-    k1, likely = certain_part(estimate, error), abs(estimate) + BOUND_ERRORS * error
+    k1, at_most = certain_part(estimate, error), abs(estimate) + BOUND_ERRORS * error
     if k1 == 0.0:
-        return Remaining(0.0, 0.0, likely)
+        return Remaining(0.0, 0.0, at_most)
     sheared = (tracks.right_px[0] - tracks.K_rights[0][:2, 2]) / tracks.K_rights[0][0, 0]
     explanations = _by_rotation(tracks, T), sheared
     others = [certain_part(*_fit_k1(tracks, T, explained)) for explained in explanations]
     alone = min((k1, *others), key=abs) if all(other * k1 > 0 for other in others) else 0.0
-    return Remaining(k1, alone, likely)
+    return Remaining(k1, alone, at_most)
 
 
 def _by_rotation(tracks: Tracks, T: np.ndarray) -> np.ndarray:

@@ -201,7 +201,7 @@ class _Signs(NamedTuple):
         """Whether the few matches of one small pair exclude every other fault; an unknown sign does not."""
         return not self.mistakes and (
             self.behind.share <= LITTLE_BEHIND
-            and self.distortion.likely <= LITTLE_DISTORTION
+            and self.distortion.at_most <= LITTLE_DISTORTION
             and self.moved <= LITTLE_MOVED
             and self.exchangeable <= LITTLE_EXCHANGED
         )

@@ -35,7 +35,8 @@ GROUPED_PIXELS = 16
 GROUPED_PLANES = 64
 #: Candidates of the coarsest grids, as a power of two.
 PADDED = triton.next_power_of_2(max(points.BASIN_CANDIDATES, volume_search.COARSE_GRID) ** 2)
-#: Arrays of one number a candidate or a map. They begin anywhere, and no kernel is compiled anew for where.
+#: Arrays of one number a candidate or a map. They may begin anywhere: a kernel is not compiled anew for those
+#: that begin at a multiple of 16 bytes.
 _NUMBERS = [
     *("near_m", "far_m", "cost", "near_of", "far_of", "chosen"),
     *("before_cost", "before_near", "before_far", "cost_of", "size"),

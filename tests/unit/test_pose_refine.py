@@ -356,10 +356,10 @@ def test_distortion_of_both_pictures_is_measured(k1: float, E: np.ndarray) -> No
         return 500.0 * x * (1.0 + k1 * (x**2).sum(-1, keepdims=True)) + K[:2, 2]
 
     bent = replace(tracks, left_px=distorted(tracks.left_px), right_px=distorted(tracks.right_px))
-    found, alone, likely = remaining_distortion(bent, Ts[0])
+    found, alone, at_most = remaining_distortion(bent, Ts[0])
     assert found == pytest.approx(k1, abs=0.03) and abs(found) <= abs(k1) + 0.005
-    assert abs(k1) < likely < abs(k1) + 0.03
-    assert remaining_distortion(bent.kept(slice(100)), Ts[0]).likely > likely, "fewer matches exclude less"
+    assert abs(k1) < at_most < abs(k1) + 0.03
+    assert remaining_distortion(bent.kept(slice(100)), Ts[0]).at_most > at_most, "fewer matches exclude less"
     assert alone == pytest.approx(k1, abs=0.06) and abs(alone) <= abs(found)
     assert np.isnan(remaining_distortion(bent.kept(slice(39)), Ts[0])).all()
 
