@@ -1,4 +1,4 @@
-"""Threads: of torch on the CPU, never more than cores that this process may use; and ``Beside``.
+"""Threads: of torch on the CPU, never more than cores that this process may use; and ``BackgroundTask``.
 
 With twice as many threads as cores a guided call takes twice as long. torch does not count the CPU quota of a
 container, and takes any number from ``OMP_NUM_THREADS`` and ``torch.set_num_threads``. The number belongs to
@@ -22,7 +22,7 @@ from torch import Tensor
 
 T = TypeVar("T")
 #: More pieces of work than there ever are at a time: with fewer threads they could wait for each other.
-MOST_BESIDE = 1 << 16
+MOST_TASKS = 1 << 16
 
 
 def available_cores() -> int:
@@ -63,7 +63,7 @@ def leaves_cpu_free(device: torch.device) -> bool:
     return device.type == "cuda"
 
 
-class Beside(Generic[T]):
+class BackgroundTask(Generic[T]):
     """The answer of a function that another thread works out while the caller goes on.
 
     A guided call on CUDA makes its evidence like this, beside the network's first steps, which are not
@@ -99,7 +99,7 @@ class Beside(Generic[T]):
             self._stream = torch.cuda.current_stream(device)
             if own_stream:
                 ready = self._stream.record_event() if follows else None
-                self._stream = _stream_beside(device)
+                self._stream = _task_stream(device)
 
         begun = threading.Event()
 
@@ -111,7 +111,7 @@ class Beside(Generic[T]):
                 return context.run(function)
 
         if not own_stream:
-            self._answer = _threads_beside(os.getpid()).submit(work)
+            self._answer = _task_threads(os.getpid()).submit(work)
             return
         self._answer = _in_new_thread(work)
         # To start the thread is not enough: the caller would keep Python's lock, for up to five milliseconds,
@@ -119,7 +119,7 @@ class Beside(Generic[T]):
         begun.wait()
 
     @classmethod
-    def known(cls, answer: T) -> Beside[T]:
+    def known(cls, answer: T) -> BackgroundTask[T]:
         """An answer that is there already."""
         return cls(lambda: answer, torch.device("cpu"))
 
@@ -143,7 +143,7 @@ class Beside(Generic[T]):
         """
         if self._answer.exception() is None:
             for part in _parts_of(self.result()):
-                if isinstance(part, Beside):
+                if isinstance(part, BackgroundTask):
                     part.close()
 
 
@@ -156,17 +156,17 @@ def _in_new_thread(work: Callable[[], T]) -> Future[T]:
 
 
 @functools.cache
-def _threads_beside(process: int) -> ThreadPoolExecutor:
+def _task_threads(process: int) -> ThreadPoolExecutor:
     """Threads of a process for work of the CPU, one more where all are busy: one may wait for another.
 
     They stay for what comes next. To start one takes long while others have Python's lock, and who starts it
     waits meanwhile.
     """
-    return ThreadPoolExecutor(MOST_BESIDE, thread_name_prefix="geodiff-beside")
+    return ThreadPoolExecutor(MOST_TASKS, thread_name_prefix="geodiff-background")
 
 
 @functools.cache
-def _stream_beside(device: torch.device) -> torch.cuda.Stream:
+def _task_stream(device: torch.device) -> torch.cuda.Stream:
     """One stream for all, as memory that one stream has freed is not given to another.
 
     Its small kernels go before those of a network, of which each would otherwise wait for a large one to end.

@@ -10,7 +10,7 @@ from typing import Self
 
 from torch import Tensor
 
-from geodiff_plugin._threads import Beside
+from geodiff_plugin._threads import BackgroundTask
 from geodiff_plugin.matching import CostVolume, Matches
 from geodiff_plugin.matching.rows import RowMatches
 from geodiff_plugin.messages import Message
@@ -28,8 +28,8 @@ class Evidence:
     matches: Matches | None  # aggregated, left-right checked, where a term asks
     points: Matches | None = None  # depths that the user knows, in the form of matches
     reliable: Matches | None = None  # ``matches`` as points for the search, where enough are reliable
-    rows: Beside[RowMatches] | None = None  # of a rectified pair, at the image's size; act 3 asks for them
-    report: Beside[PoseReport] | None = None  # how the poses fit, where act 3 asks
+    rows: BackgroundTask[RowMatches] | None = None  # of a rectified pair, at the image's size, for act 3
+    report: BackgroundTask[PoseReport] | None = None  # how the poses fit, for act 3
     noticed: tuple[Message, ...] = ()  # what the matching warns of
 
     def within(self, valid: Tensor) -> Self:

@@ -46,7 +46,7 @@ class Inputs:
         """The left image, on any device, with its right views as they were read, on the CPU."""
         return PosedViews(left_01, self.views, torch.from_numpy(self.K_left).float())
 
-    def beside(self, left_01: Tensor) -> PosedViews:
+    def posed_views(self, left_01: Tensor) -> PosedViews:
         """The left image with its right views on its device, and their cameras on the CPU; all float32."""
         device = left_01.device
         views = tuple(view._replace(image_01=view.image_01.to(device, torch.float32)) for view in self.views)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import geodiff_plugin.matching as matching
 from geodiff_plugin._checks import InputError
-from geodiff_plugin._threads import Beside, leaves_cpu_free, sent_to_cpu
+from geodiff_plugin._threads import BackgroundTask, leaves_cpu_free, sent_to_cpu
 from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.inputs import Inputs
@@ -54,8 +54,8 @@ def make_evidence(
     """
     checks = bool(given.views) and config.pose != "given"
     if checks and leaves_cpu_free(left_01.device):
-        return _made_beside_check(left_01, given, config, measured_baseline)
-    posed, points = given.beside(left_01), given.points_on(left_01.device)
+        return _made_during_check(left_01, given, config, measured_baseline)
+    posed, points = given.posed_views(left_01), given.points_on(left_01.device)
     if not posed.views:
         return prepare_evidence(posed, points, config)
     posed = _with_clean_images(posed, config)
@@ -64,10 +64,10 @@ def make_evidence(
     else:
         views, report = refine_views(posed, measure_fit(posed_greys(posed)), measured_baseline)
         posed = posed._replace(views=views)
-    return replace(prepare_evidence(posed, points, config), report=Beside.known(report))
+    return replace(prepare_evidence(posed, points, config), report=BackgroundTask.known(report))
 
 
-def _made_beside_check(
+def _made_during_check(
     left_01: Tensor, given: Inputs, config: GuidanceConfig, measured_baseline: bool
 ) -> Evidence:
     """The same, where the device matches the views while the CPU matches their features.
@@ -76,20 +76,22 @@ def _made_beside_check(
     poses fit, the views are matched as given. Small pictures mostly show that they fit; what else there is to
     find then changes no view, and act 3 is the first to ask.
     """
-    check, evidence = _check_beside(given.with_left(left_01)), None
-    posed, points = given.beside(left_01), given.points_on(left_01.device)
+    check, evidence = _check_in_background(given.with_left(left_01)), None
+    posed, points = given.posed_views(left_01), given.points_on(left_01.device)
     clear = _with_clean_images(posed, config)
     if clear is not posed:
-        check = _check_beside(clear)
+        check = _check_in_background(clear)
     with suppress(InputError):  # raised again below, unless a refined pose mends it
         evidence = prepare_evidence(clear, points, config)
     views = clear.views
     if check.small.result().surely or check.fit.result().fits:
         fit = check.fit
-        report = Beside(lambda: refine_views(clear, fit.result(), measured_baseline).report, left_01.device)
+        report = BackgroundTask(
+            lambda: refine_views(clear, fit.result(), measured_baseline).report, left_01.device
+        )
     else:
         views, found = refine_views(clear, check.fit.result(), measured_baseline)
-        report = Beside.known(found)
+        report = BackgroundTask.known(found)
     if evidence is None or any(one is not other for one, other in zip(views, clear.views, strict=True)):
         evidence = prepare_evidence(clear._replace(views=views), points, config)
     return replace(evidence, report=report)
@@ -98,21 +100,21 @@ def _made_beside_check(
 class _Check(NamedTuple):
     """Whether poses fit, as the CPU works it out."""
 
-    small: Beside[PoseFit]  # ``fit_of_small``, there first
-    fit: Beside[PoseFit]
+    small: BackgroundTask[PoseFit]  # ``fit_of_small``, there first
+    fit: BackgroundTask[PoseFit]
 
 
-def _check_beside(posed: PosedViews) -> _Check:
+def _check_in_background(posed: PosedViews) -> _Check:
     """The check of views of which the left one, at least, is on the device."""
     device = posed.left_01.device
-    greys = Beside(lambda: posed_greys(posed), device)
-    small = Beside(lambda: fit_of_small(greys.result()), device)
+    greys = BackgroundTask(lambda: posed_greys(posed), device)
+    small = BackgroundTask(lambda: fit_of_small(greys.result()), device)
 
     def fit() -> PoseFit:
         _ = greys.result().signs  # while another thread looks for features; ``refine_views`` reads them later
         return measure_fit(greys.result(), small.result)
 
-    return _Check(small, Beside(fit, device))
+    return _Check(small, BackgroundTask(fit, device))
 
 
 def prepare_evidence(native: PosedViews, points: Tensor | None, config: GuidanceConfig) -> Evidence:
@@ -129,7 +131,7 @@ def prepare_evidence(native: PosedViews, points: Tensor | None, config: Guidance
         volume = matching.build_cost_volume(native, depth_range=config.depth_range, config=config)
         if needs_matches:
             matches = matching.match_volume(volume)
-            rows = rows_beside(pictures, matches, known_points)
+            rows = rows_in_background(pictures, matches, known_points)
         if matching.inverse_pose_preferred(native, matches):
             noticed.append(INVERSE)
     if left_out:
@@ -149,9 +151,9 @@ def prepare_evidence(native: PosedViews, points: Tensor | None, config: Guidance
     return evidence
 
 
-def rows_beside(
+def rows_in_background(
     pictures: RowPictures | None, matches: Matches, points: Matches | None
-) -> Beside[RowMatches] | None:
+) -> BackgroundTask[RowMatches] | None:
     """The rows of a rectified pair, matched by the CPU while a GPU goes on: act 3 is the first to ask.
 
     They are sought up to the nearest of the matches and known points; ``None`` without such a pair.
@@ -162,7 +164,7 @@ def rows_beside(
     if points is not None:
         nearest = torch.maximum(nearest, points.inverse_depth.amax())
     received = sent_to_cpu(nearest)
-    return Beside(lambda: match_rows(pictures, pictures.shift_px(float(received()))), pictures.device)
+    return BackgroundTask(lambda: match_rows(pictures, pictures.shift_px(float(received()))), pictures.device)
 
 
 def _read_back(evidence: Evidence) -> None:

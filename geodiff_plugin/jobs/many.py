@@ -12,7 +12,7 @@ import torch
 
 from geodiff_plugin._checks import InputError, refuse
 from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin._threads import Beside, WithinCores, available_cores, leaves_cpu_free
+from geodiff_plugin._threads import BackgroundTask, WithinCores, available_cores, leaves_cpu_free
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.evidence.store import EvidenceStore
@@ -145,7 +145,7 @@ class Stages:
             # Threads share a stream by default, and the network of the pair before still runs on it. The
             # evidence has a stream of its own, which does not wait for that network.
             work = functools.partial(_prepare, guidance, left, device)
-            Beside(work, device, own_stream=True, follows=False).result()
+            BackgroundTask(work, device, own_stream=True, follows=False).result()
         return pair
 
     @functools.cached_property

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from geodiff_plugin._threads import Beside, sent_to_cpu
+from geodiff_plugin._threads import BackgroundTask, sent_to_cpu
 from geodiff_plugin.geometry import image_size, is_rectified, resize_image, size_within
 from geodiff_plugin.matching.census import grey
 from geodiff_plugin.matching.consistency import known_share
@@ -58,7 +58,7 @@ class RowMatches(NamedTuple):
     hidden: Tensor  # 1 in a gap between two that the right view cannot see (``hidden_gaps``)
     filled: Tensor  # 1 in another gap between two; the shift of a gap is that of its farther end
     baseline_m: Tensor  # () distance of the cameras, metres, on the CPU
-    checks: Beside[RowChecks]  # still being worked out while the maps are used: the verdict asks
+    checks: BackgroundTask[RowChecks]  # still being worked out while the maps are used: the verdict asks
 
     @property
     def certain(self) -> Tensor:
@@ -70,7 +70,7 @@ class RowPictures(NamedTuple):
     """A rectified pair as its rows are matched; mirrored if its second view is on the left."""
 
     greys: Callable[[], tuple[np.ndarray, np.ndarray]]  # left, right: (H, W) uint8; it waits for them
-    lines: Beside[np.ndarray]  # (N, 4), ``upright_lines`` of the left one
+    lines: BackgroundTask[np.ndarray]  # (N, 4), ``upright_lines`` of the left one
     infinity_px: float  # disparity of a point at infinity
     focal_px: float  # of the left one, along the rows
     shift_m: np.floating[Any]  # of left points into the right frame, along the rows; above 0: mirrored
@@ -150,7 +150,7 @@ def row_pictures(left_01: Tensor, view: CameraView, K_left: Tensor) -> RowPictur
         left, right = map(np.ascontiguousarray, both)
         return left, right
 
-    lines = Beside(lambda: upright_lines(greys()[0]), left_01.device)
+    lines = BackgroundTask(lambda: upright_lines(greys()[0]), left_01.device)
     infinity = -infinity if mirrored else infinity
     return RowPictures(greys, lines, infinity, float(K[0, 0]), T[0, 3], left_01.device)
 
@@ -184,7 +184,7 @@ def match_rows(pictures: RowPictures, nearest_px: float) -> RowMatches:
         shear = certain_shear(pictures.lines.result(), shift, known)
         return RowChecks(shear, occlusion_order(left, shift, gaps))
 
-    checks = Beside(checked, pictures.device)
+    checks = BackgroundTask(checked, pictures.device)
     return RowMatches(shift_on, matched, hidden_on, filled_on, baseline_m, checks)
 
 

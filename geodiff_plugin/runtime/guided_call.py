@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, noted, refuse, warn
 from geodiff_plugin._kernels import compilation_ahead, without_kernels
-from geodiff_plugin._threads import Beside
+from geodiff_plugin._threads import BackgroundTask
 from geodiff_plugin.algorithm.prompt import depth_prompt
 from geodiff_plugin.algorithm.schedule import count_steps
 from geodiff_plugin.evidence.evidence import Evidence
@@ -141,7 +141,7 @@ class GuidedCall(_Stock):
             logging.getLogger(__name__).info(line)
         call["image"] = lefts_01 = lefts_01.to(device)
         guidance.check_left_images(lefts_01)
-        evidence = Beside(lambda: _prepared(guidance, lefts_01), device, own_stream=True)
+        evidence = BackgroundTask(lambda: _prepared(guidance, lefts_01), device, own_stream=True)
         try:
             codec = MapCodec(self, prior, self._processing_grid(call, device), tiny)
             if prior.takes_prompt and call.get("prompt_depth") is None:

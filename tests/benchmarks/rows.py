@@ -49,7 +49,7 @@ class Score:
 def _on_grid(sample: StereoSample) -> tuple[PosedViews, np.ndarray]:
     """The views at the size at which rows are matched, and the true depth there, 0 where unknown."""
     guidance = GeometryGuidance(sample.right, (sample.K_left, sample.K_right), sample.E)
-    native = guidance.inputs[0].beside(left_images(sample.left)[0])
+    native = guidance.inputs[0].posed_views(left_images(sample.left)[0])
     size = grid_of_rows(native.size)
     left_01, K = resize_image(native.left_01, native.K_left, size)
     (view,) = native.views

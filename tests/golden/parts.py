@@ -27,7 +27,7 @@ from geodiff_plugin.algorithm.state import chunk_views
 from geodiff_plugin.algorithm.terms import Given, Objective, match_exposure, photometric, ssim
 from geodiff_plugin.config import DEFAULT, MARIGOLD_DC, PAPER, UpdatePlan
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.evidence.prepare import prepare_evidence, rows_beside
+from geodiff_plugin.evidence.prepare import prepare_evidence, rows_in_background
 from geodiff_plugin.formats.images import intrinsics_from_exif
 from geodiff_plugin.geometry import (
     hidden_in_right,
@@ -408,7 +408,7 @@ def finished() -> dict[str, object]:
     for e in (0.03, 0.12):
         error = torch.full((1, 1, 1, 1), e)
         native = PosedViews(left, (*views, rectified), K)
-        rows = rows_beside(rectified_pictures(native), target, None)
+        rows = rows_in_background(rectified_pictures(native), target, None)
         evidence = Evidence(native, native, None, target, rows=rows)
         voted_m = vote_depth(depth_m, evidence, target, known_share(target), error)
         result[f"voted_{e}"] = (voted_m / depth_m).log()

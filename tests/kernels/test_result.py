@@ -7,7 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin._threads import Beside
+from geodiff_plugin._threads import BackgroundTask
 from geodiff_plugin.matching.rows import RowChecks, RowMatches
 from geodiff_plugin.result.confidence import Grounds, _photometric_error, _warped, depth_confidence
 from geodiff_plugin.result.voting import WIDE, Voters, _crispness, _enlarged, _step_shares, _voted
@@ -29,7 +29,7 @@ def random_voters(seed: int, size: tuple[int, int], device: torch.device) -> tup
     shift = px.to(device) / depth_m * (1.0 + 0.1 * rand(*size))
     gap, seen = 1.0 - matched, rand(*size) > 0.5
     maps = shift, matched, gap * ~seen, gap * seen * (rand(*size) > 0.5)
-    checks = Beside(lambda: RowChecks(math.nan, math.nan), torch.device("cpu"))
+    checks = BackgroundTask(lambda: RowChecks(math.nan, math.nan), torch.device("cpu"))
     rows = RowMatches(*maps, torch.tensor(0.1), checks)
     return Voters(depth_m, inverse_depth, confidence, rand(*size), rows, px), rand(3, *size)
 

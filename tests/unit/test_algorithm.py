@@ -19,7 +19,7 @@ from geodiff_plugin.algorithm.solver import FieldSystem, RobustField, solve_fiel
 from geodiff_plugin.algorithm.terms import Given, Loss
 from geodiff_plugin.config import DEFAULT
 from geodiff_plugin.evidence.evidence import Evidence
-from geodiff_plugin.evidence.prepare import rows_beside
+from geodiff_plugin.evidence.prepare import rows_in_background
 from geodiff_plugin.geometry import image_size
 from geodiff_plugin.matching import Matches, known_share, rows
 from geodiff_plugin.matching.rows import (
@@ -353,7 +353,7 @@ def voted(map_m: Tensor, left: Tensor, views, matched_m: Tensor, confidence: flo
     target = Matches(1.0 / matched_m, torch.full_like(matched_m, confidence), torch.full((1,), 2e-3))
     native = PosedViews(left[0], tuple(views), CAMERA)
     evidence = Evidence(
-        native, native, None, target, rows=rows_beside(rectified_pictures(native), target, None)
+        native, native, None, target, rows=rows_in_background(rectified_pictures(native), target, None)
     )
     return vote_depth(map_m, evidence, target, known_share(target), torch.full((1, 1, 1, 1), error), *spacing)
 

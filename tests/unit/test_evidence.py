@@ -15,7 +15,7 @@ from geodiff_plugin.config import KNOBS, GuidanceConfig
 from geodiff_plugin.evidence import prepare
 from geodiff_plugin.evidence import store as evidence_store
 from geodiff_plugin.evidence.inputs import Inputs
-from geodiff_plugin.evidence.prepare import make_evidence, prepare_evidence, rows_beside
+from geodiff_plugin.evidence.prepare import make_evidence, prepare_evidence, rows_in_background
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.geometry import warp_right_to_left
 from geodiff_plugin.matching import Matches
@@ -195,5 +195,5 @@ def test_rows_are_sought_up_to_the_nearest_of_matches_and_known_points(monkeypat
     )
     here = torch.device("cpu")
     pictures = SimpleNamespace(shift_px=lambda inverse_depth: 7.0 * inverse_depth, device=here)
-    assert rows_beside(pictures, matches, points).result() == 14.0
-    assert rows_beside(None, matches, points) is None
+    assert rows_in_background(pictures, matches, points).result() == 14.0
+    assert rows_in_background(None, matches, points) is None

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from geodiff_plugin._threads import Beside
+from geodiff_plugin._threads import BackgroundTask
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.matching.rows import RowChecks, RowMatches
 from geodiff_plugin.result.indicators import indicators_of
@@ -156,10 +156,10 @@ def test_the_indicators_of_a_run_hold_the_worst_view_in_pixels_of_the_left_image
     )
     pose = replace(pose, exchangeable=0.3, moved=0.2, bars=0.1)
     native = PosedViews(left, views, torch.from_numpy(K))
-    found = indicators_of(Evidence(native, native, None, None, report=Beside.known(pose)), {})
+    found = indicators_of(Evidence(native, native, None, None, report=BackgroundTask.known(pose)), {})
     assert (found.straightened_px, found.behind_px, found.depth_spread) == (1.5, 4.0, 0.2)
     assert (found.exchangeable, found.moved, found.bars) == (0.3, 0.2, 0.1)
-    checks = Beside.known(RowChecks(shear=0.01, occlusion=-0.5))
-    rows = Beside.known(RowMatches(left, left, left, left, torch.tensor(0.1), checks))
+    checks = BackgroundTask.known(RowChecks(shear=0.01, occlusion=-0.5))
+    rows = BackgroundTask.known(RowMatches(left, left, left, left, torch.tensor(0.1), checks))
     found = indicators_of(Evidence(native, native, None, None, rows=rows), {})
     assert (found.occlusion, found.shear) == (-0.5, pytest.approx(0.01 * 20 / 1664))

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from geodiff_plugin import GeometryGuidance
-from geodiff_plugin._threads import Beside
+from geodiff_plugin._threads import BackgroundTask
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evidence import prepare as prepare_module
 from geodiff_plugin.evidence.evidence import Evidence
@@ -480,7 +480,7 @@ def test_a_tracker_keeps_the_scene_and_a_measured_baseline_its_length(pair) -> N
         grid=native,
         volume=None,
         matches=None,
-        report=Beside.known(report),
+        report=BackgroundTask.known(report),
     )
     assert indicators_of(seen, {}).scale_spread == report.scale_spread
     assert np.isnan(indicators_of(seen, {}, has_unit=False).scale_spread)
@@ -571,7 +571,7 @@ def test_everything_downstream_sees_the_refined_pose(pair) -> None:
     assert np.allclose(np.linalg.inv(given.native.views[0][2].numpy()), wrong, atol=1e-5)
 
 
-def check_beside_matching(monkeypatch) -> None:
+def check_during_matching(monkeypatch) -> None:
     """As on CUDA: the poses are checked in threads beside the matching of the views."""
     for module in ("_threads", "evidence.prepare"):
         monkeypatch.setattr(f"geodiff_plugin.{module}.leaves_cpu_free", lambda device: True)
@@ -605,7 +605,7 @@ def test_evidence_made_beside_the_check_of_the_poses_is_the_same(
     guidance = GeometryGuidance(right, (pair.K_left.numpy(), pair.K_right.numpy()), E)
     (alone,) = guidance.prepare(left[None])
     assert torch.equal(alone.native.left_01, left) == (noise == 0.0)
-    check_beside_matching(monkeypatch)
+    check_during_matching(monkeypatch)
     (beside,) = guidance.prepare(left[None])
     reports = [each.report.result() for each in (alone, beside)]
     assert all(report.status == status for report in reports)
@@ -620,12 +620,12 @@ def test_flow_is_asked_about_few_features_beside_the_matching_as_well(pair, monk
     E = pair.E.numpy() @ pose((0.8, -0.8, 0), (0, 0, 0))
     left, right = pair.left.image_01.float(), pair.right.image_01.float()
     guidance = GeometryGuidance(right, (pair.K_left.numpy(), pair.K_right.numpy()), E)
-    posed = guidance.inputs[0].beside(left)
+    posed = guidance.inputs[0].posed_views(left)
     count = int(fit_module.measure_fit(fit_module.posed_greys(posed)).tracks.seen.sum())
     for module in (fit_module, refine, tracks_module):
         monkeypatch.setattr(module, "FEWEST", count + 1)
     (alone,) = guidance.prepare(left[None])
-    check_beside_matching(monkeypatch)
+    check_during_matching(monkeypatch)
     (beside,) = guidance.prepare(left[None])
     assert [each.report.result().status for each in (alone, beside)] == ["refined", "refined"]
     assert torch.equal(alone.volume.levels, beside.volume.levels)
@@ -636,7 +636,7 @@ def test_evidence_of_poses_that_fit_is_there_before_all_is_known_about_them(pair
     asked = threading.Event()
 
     hold_until(asked, "refine_views", monkeypatch)
-    check_beside_matching(monkeypatch)
+    check_during_matching(monkeypatch)
     guidance = GeometryGuidance(
         pair.right.image_01, (pair.K_left.numpy(), pair.K_right.numpy()), pair.E.numpy()
     )
@@ -660,7 +660,7 @@ def test_small_pictures_that_show_that_poses_fit_are_enough(monkeypatch) -> None
     asked = threading.Event()
 
     hold_until(asked, "measure_fit", monkeypatch)
-    check_beside_matching(monkeypatch)
+    check_during_matching(monkeypatch)
     shown = read_demo_pair()
     guidance = GeometryGuidance(shown.right, (shown.rig.K_left, shown.rig.K_right), shown.rig.E)
     (made,) = guidance.prepare(torch.from_numpy(shown.left).permute(2, 0, 1)[None])

@@ -1,4 +1,4 @@
-"""``Beside``: what its answer holds, and that it is the function's own."""
+"""``BackgroundTask``: what its answer holds, and that it is the function's own."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 
 from geodiff_plugin import GeometryGuidance, _kernels, _threads
 from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin._threads import Beside, sent_to_cpu, tensors_of
+from geodiff_plugin._threads import BackgroundTask, sent_to_cpu, tensors_of
 from geodiff_plugin.bundled.demo_pair import read_demo_pair
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.matching import rows
@@ -24,7 +24,7 @@ def _reachable(evidence: Evidence) -> dict[int, torch.Tensor]:
     seen, found, queue = set[int](), dict[int, torch.Tensor](), [evidence]
     while queue:
         value = queue.pop()
-        if id(value) in seen or isinstance(value, (type, Beside)) or callable(value):
+        if id(value) in seen or isinstance(value, (type, BackgroundTask)) or callable(value):
             continue
         seen.add(id(value))
         if isinstance(value, torch.Tensor):
@@ -51,7 +51,7 @@ def test_every_tensor_of_an_evidence_is_kept_for_the_stream_that_reads_it(eviden
 
 def test_the_answer_is_worked_out_at_once_where_the_caller_needs_the_same_cores():
     calls: list[int] = []
-    answer = Beside(lambda: calls.append(1) or "answer", torch.device("cpu"), own_stream=True)
+    answer = BackgroundTask(lambda: calls.append(1) or "answer", torch.device("cpu"), own_stream=True)
     assert calls == [1]
     assert (answer.result(), answer.result(), calls) == ("answer", "answer", [1])
     answer.close()
@@ -59,7 +59,7 @@ def test_the_answer_is_worked_out_at_once_where_the_caller_needs_the_same_cores(
 
 def test_what_the_function_raises_at_once_reaches_the_caller():
     with pytest.raises(ZeroDivisionError):
-        Beside(lambda: 1 / 0, torch.device("cpu"))
+        BackgroundTask(lambda: 1 / 0, torch.device("cpu"))
 
 
 class Stream:
@@ -107,7 +107,7 @@ def card(monkeypatch) -> SimpleNamespace:
     now.stream = Stream("caller", said, device)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda _: now.stream)
     monkeypatch.setattr(torch.cuda, "stream", on)
-    monkeypatch.setattr(_threads, "_stream_beside", lambda _: beside)
+    monkeypatch.setattr(_threads, "_task_stream", lambda _: beside)
     return SimpleNamespace(device=device, said=said)
 
 
@@ -118,7 +118,7 @@ def test_on_a_card_the_callers_stream_waits_for_the_answer_and_keeps_its_tensors
         seen.append((now.stream.name, torch.is_grad_enabled(), threading.current_thread().name))
         return {"parts": [torch.zeros(2), torch.zeros(3).as_subclass(OnCard)]}
 
-    answer = Beside(work, card.device, own_stream=True)
+    answer = BackgroundTask(work, card.device, own_stream=True)
     first = answer.result()
     assert answer.result() is first
     ((stream, gradients, thread),) = seen
@@ -133,7 +133,7 @@ def test_on_a_card_the_callers_stream_waits_for_the_answer_and_keeps_its_tensors
 
 def test_every_stream_that_asks_waits_for_the_answer(card):
     """As that of another thread does, whose pipeline shares the guidance."""
-    answer = Beside(lambda: torch.zeros(2).as_subclass(OnCard), card.device, own_stream=True)
+    answer = BackgroundTask(lambda: torch.zeros(2).as_subclass(OnCard), card.device, own_stream=True)
     answer.result()
     now.stream = Stream("another", card.said, card.device)
     before = len(card.said)
@@ -144,26 +144,26 @@ def test_every_stream_that_asks_waits_for_the_answer(card):
 
 def test_the_stream_of_who_closes_waits_for_what_nobody_asked_for(card):
     """Else the memory that the work still reads could be given away."""
-    answer = Beside(lambda: torch.zeros(2), card.device, own_stream=True)
+    answer = BackgroundTask(lambda: torch.zeros(2), card.device, own_stream=True)
     answer.close()
     assert card.said[-1] == ("caller", "waits for beside")
 
 
 def test_work_that_reads_nothing_of_the_caller_waits_for_nothing_on_its_stream(card):
-    answer = Beside(lambda: now.stream.name, card.device, own_stream=True, follows=False)
+    answer = BackgroundTask(lambda: now.stream.name, card.device, own_stream=True, follows=False)
     assert answer.result() == "beside"
     assert card.said == [("caller", "waits for beside")]
 
 
 def test_without_a_stream_of_its_own_the_work_goes_to_the_callers(card):
-    answer = Beside(lambda: now.stream.name, card.device)
+    answer = BackgroundTask(lambda: now.stream.name, card.device)
     assert answer.result() == "caller" and card.said == []
 
 
 def test_the_thread_has_the_context_of_its_caller(card):
     kept = _kernels._switched_on
     with without_kernels():
-        answer = Beside(kept.get, card.device)
+        answer = BackgroundTask(kept.get, card.device)
     assert answer.result() is False and kept.get() is True
 
 
@@ -175,7 +175,7 @@ def test_closing_waits_for_the_work_and_what_it_raised_is_for_whoever_asks(card)
         ended.append(1)
         raise ZeroDivisionError
 
-    answer = Beside(work, card.device)
+    answer = BackgroundTask(work, card.device)
     answer.close()
     assert ended == [1]
     with pytest.raises(ZeroDivisionError):
@@ -183,17 +183,17 @@ def test_closing_waits_for_the_work_and_what_it_raised_is_for_whoever_asks(card)
 
 
 def test_a_thread_stays_for_the_next_work(card):
-    first = Beside(threading.get_ident, card.device).result()
+    first = BackgroundTask(threading.get_ident, card.device).result()
     deadline = time.monotonic() + 30
-    while Beside(threading.get_ident, card.device).result() != first:  # it may not be idle at once
+    while BackgroundTask(threading.get_ident, card.device).result() != first:  # it may not be idle at once
         assert time.monotonic() < deadline
 
 
 def test_work_may_wait_for_other_work_however_deep(card):
     def depth(left: int) -> int:
-        return left and 1 + Beside(lambda: depth(left - 1), card.device).result()
+        return left and 1 + BackgroundTask(lambda: depth(left - 1), card.device).result()
 
-    assert Beside(lambda: depth(100), card.device).result() == 100
+    assert BackgroundTask(lambda: depth(100), card.device).result() == 100
 
 
 def test_closing_waits_for_the_threads_that_an_answer_holds(card):
@@ -203,7 +203,7 @@ def test_closing_waits_for_the_threads_that_an_answer_holds(card):
         time.sleep(0.05)
         ended.append(1)
 
-    answer = Beside(lambda: {"still": [Beside(work, card.device)]}, card.device)
+    answer = BackgroundTask(lambda: {"still": [BackgroundTask(work, card.device)]}, card.device)
     answer.close()
     assert ended == [1]
 
