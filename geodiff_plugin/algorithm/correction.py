@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -12,7 +13,7 @@ from torch import Tensor
 from geodiff_plugin._kernels import launch_bound, use_kernel
 from geodiff_plugin.algorithm.solver import RobustField, RobustSystem, solve_robust
 from geodiff_plugin.config import DEFAULT, GuidanceConfig
-from geodiff_plugin.geometry import image_size
+from geodiff_plugin.geometry import image_size, to_device_of
 from geodiff_plugin.matching import Matches, with_points
 from geodiff_plugin.scale.points import weighted_quantile
 
@@ -265,14 +266,15 @@ def prior_error(
     observed = _observations(depth_m, target, left_01, config)
     height, width = observed.residual.shape[-2:]
     side = max(1, round(BLOCK * max(height, width)))
-    rows, columns = (torch.arange(n, device=depth_m.device) // side for n in (height, width))
-    black = ((rows[:, None] + columns[None]) % 2).to(observed.residual.dtype)
+    is_odd = np.concatenate([np.arange(n) // side % 2 for n in (height, width)]) > 0
+    odd_row, odd_column = to_device_of(depth_m, is_odd).split([height, width])
+    black = odd_row[:, None] != odd_column
     weight_of_black = observed.weight * black
     first = _spread(observed.residual, observed)
     trusted = torch.cat([weight_of_black, observed.weight - weight_of_black])
     of_black, of_white = _stiff(observed, trusted, first, config).field.chunk(2)
-    error = _spread(torch.where(black > 0, of_white, of_black) - observed.residual, observed)
-    share = ((observed.weight > 0).float().sum((1, 2, 3), keepdim=True) / FEW_POINTS).clamp_max(1.0)
+    error = _spread(torch.where(black, of_white, of_black) - observed.residual, observed)
+    share = ((observed.weight > 0).sum((1, 2, 3), keepdim=True) / FEW_POINTS).clamp_max(1.0)
     return error**share * MOST_ERROR ** (1.0 - share)
 
 

@@ -5,6 +5,7 @@ Source: Algorithm 1 (plain step), Eq. 15 (eq:final_score), S5.1 (learning rate 1
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol
@@ -44,22 +45,22 @@ class FiniteWatch:
 
     def __init__(self) -> None:
         self._names: list[tuple[str, int]] = []
-        self._extremes: list[Tensor] = []
+        self._extremes: list[Tensor] = []  # () each, the least and the largest value of every tensor
 
     def note(self, name: str, step: int, tensor: Tensor) -> None:
         """Record a tensor of a step without waiting for its device; ``name`` is for the message."""
         self._names.append((name, step))
-        # The least and the largest value are finite if all are: one operation tells both.
-        self._extremes.append(torch.stack(tensor.detach().float().aminmax()))
+        # Both are finite if all values are: one operation tells them, and the tensor itself is not kept.
+        self._extremes += tensor.detach().float().aminmax()
 
     def check(self, pipe: Any) -> None:
         """Raise ``InputError`` on the first tensor of a pipeline's run that was not finite."""
         if not self._extremes:
             return
-        finite = torch.stack(self._extremes).cpu().isfinite().all(1)
-        if finite.all():
+        finite = [math.isfinite(value) for value in torch.stack(self._extremes).tolist()]
+        if all(finite):
             return
-        name, step = self._names[int((~finite).nonzero()[0])]
+        name, step = self._names[finite.index(False) // 2]
         short = str(pipe.dtype).removeprefix("torch.")  # read here, as stock walks all layers for it
         cure = "Load the prior with dtype=torch.bfloat16 or torch.float32."
         if short != "float16":

@@ -153,12 +153,14 @@ class Trajectory:
 
     def _rank_correlation(self, x: Tensor) -> Tensor:
         """Rank correlation ``(B,)`` of the prior alone with matches or points; NaN without enough of them."""
-        correlation = x.new_full((x.shape[0],), torch.nan)
+        correlations = []
         for samples, judged in zip(self._images, self._judged, strict=True):
-            target = judged.matches or judged.points
-            if target is not None:
-                correlation[samples] = order_agreement(x[samples], target, self.metric.space)
-        return correlation
+            target, of_image = judged.matches or judged.points, x[samples]
+            if target is None:
+                correlations.append(x.new_full((len(of_image),), torch.nan))
+            else:
+                correlations.append(order_agreement(of_image, target, self.metric.space))
+        return joined(correlations)
 
     def _judge_matches(self, x: Tensor) -> None:
         """At the first estimate: find matches that look like reflections, and measure the prior's error."""
@@ -231,7 +233,7 @@ class Trajectory:
 
     def members(self, x: Tensor, depth_m: Tensor) -> list[Member]:
         """What act 3 gets of every sample: of the maps ``x`` without padding, and of their ``result``."""
-        near_m, far_m = depth_m.amin((1, 2, 3), keepdim=True), depth_m.amax((1, 2, 3), keepdim=True)
+        near_m, far_m = (end.view(-1, 1, 1, 1) for end in depth_m.flatten(1).aminmax(dim=1))
         measured = {
             "reflection_weight": self.reflection_weight,
             "error": self.error,

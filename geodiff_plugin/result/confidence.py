@@ -156,14 +156,15 @@ def reprojection(
 
     ``(1, 1, H, W)`` bool and float in [0, 1], in the left image's exposure, 0 where no view sees the pixel.
     """
-    best, visible = torch.full_like(depth_m, torch.inf), torch.zeros_like(depth_m, dtype=torch.bool)
+    best, visible = None, None
     for image, K_right, T in views:
         image, K_right = as_fine_as(image, K_right, K_left[0])
         warped, seen = _warped(image[None], depth_m, K_left, K_right[None], T[None])
-        error = _photometric_error(warped, left_01, seen)
-        best = torch.where(seen, torch.minimum(best, error), best)
-        visible |= seen
-    return visible, best.where(visible, torch.zeros_like(best))
+        error = torch.where(seen, _photometric_error(warped, left_01, seen), torch.inf)
+        best = error if best is None else torch.minimum(best, error)
+        visible = seen if visible is None else visible | seen
+    assert best is not None and visible is not None  # there are views
+    return visible, torch.where(visible, best, 0.0)
 
 
 def _photometric_error(warped: Tensor, left_01: Tensor, seen: Tensor) -> Tensor:

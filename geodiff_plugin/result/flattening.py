@@ -116,8 +116,9 @@ def _links_of_walls(
 ) -> tuple[Tensor, Tensor]:
     """Links on the grid of the matches, across and down; ``good`` is by how much more its values weigh."""
     edge = (DEPTH_EDGE / good.sqrt()).clamp_min(DETAIL_EDGE)
-    fitted = _links(log_depth, left_01, edge)
-    denoised = _links(log_depth_at(denoised_m, image_size(log_depth)), left_01, DENOISED_EDGE)
+    guide = _guide(left_01, image_size(log_depth))
+    fitted = _links(log_depth, guide, edge)
+    denoised = _links(log_depth_at(denoised_m, image_size(log_depth)), guide, DENOISED_EDGE)
     return torch.minimum(fitted[0], denoised[0]), torch.minimum(fitted[1], denoised[1])
 
 
@@ -127,7 +128,7 @@ def _lowering_of_detail(
     """By how much the second problem, on the grid of the votes, lowers the log depth ``(1, 1, H, W)``."""
     (height, width), size = image_size(wanted.held), grid_of_rows(image_size(log_depth))
     on_grid = _on(log_depth, size)
-    surface = _Surface(torch.exp(unit - on_grid), _links(on_grid, left_01, DETAIL_EDGE))
+    surface = _Surface(torch.exp(unit - on_grid), _links(on_grid, _guide(left_01, size), DETAIL_EDGE))
     # A slope is the change from one pixel to the next, and the pixels of this grid are smaller.
     smaller = constant_like(wanted.slopes, width / size[1], height / size[0]).view(2, 1, 1, 1)
     weight = _relative(_on(wanted.held, size) + LEAST_DETAIL_WEIGHT * good, surface)
@@ -142,9 +143,13 @@ def _on(x: Tensor, size: tuple[int, int], *, antialias: bool = False) -> Tensor:
     return F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=antialias)
 
 
-def _links(log_depth: Tensor, left_01: Tensor, edge: Tensor | float) -> tuple[Tensor, Tensor]:
+def _guide(left_01: Tensor, size: tuple[int, int]) -> Tensor:
+    """The left image on a grid."""
+    return _on(left_01.float(), size, antialias=True)
+
+
+def _links(log_depth: Tensor, guide: Tensor, edge: Tensor | float) -> tuple[Tensor, Tensor]:
     """Links on the grid of a map, which fall to a third across a step of ``edge`` in log depth."""
-    guide = _on(left_01.float(), image_size(log_depth), antialias=True)
     return edge_links(guide, log_depth * (DEPTH_EDGE / edge))
 
 

@@ -245,8 +245,8 @@ def order_agreement(x: Tensor, matches: Matches, space: str) -> Tensor:
     at = at[:: max(1, len(at) // ORDER_SAMPLES)]
     values = _values_at(x, matches.size, at)
     nearness = -values if SPACES[space].grows_with_depth else values
-    *of_maps, of_matches = _ranks(torch.cat([nearness, matches.inverse_depth.flatten()[at][None]]))
-    return (torch.stack(of_maps) * of_matches).sum(-1)
+    ranks = _ranks(torch.cat([nearness, matches.inverse_depth.flatten()[at][None]]))
+    return (ranks[:-1] * ranks[-1]).sum(-1)
 
 
 def _values_at(x: Tensor, size: tuple[int, int], at: Tensor) -> Tensor:

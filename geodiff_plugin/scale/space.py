@@ -146,7 +146,7 @@ class Space:
 
 
 def _depth_ends(a: Tensor, b: Tensor) -> Affine:
-    return Affine((b - a) / b, a / b, b.clone())
+    return Affine((b - a) / b, a / b, b)
 
 
 def _disparity_ends(a: Tensor, b: Tensor) -> Affine:

@@ -21,8 +21,8 @@ READ_BACK = (
     *("aten::repeat_interleave.Tensor", "aten::_linalg_check_errors", "aten::_unique2", "aten::unique_dim"),
 )
 HOSTS = ("geodiff_plugin", "diffusers", "transformers", "kornia")
-#: Files that look up the timestep in a scheduler's tables; both lie on the CPU.
-ON_THE_CPU = {"scheduling_ddim.py", "noise_levels.py"}
+#: The file that looks up the timestep in a scheduler's table; both lie on the CPU.
+ON_THE_CPU = {"noise_levels.py"}
 
 
 class ReadBacks(TorchDispatchMode):
