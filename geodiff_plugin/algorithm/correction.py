@@ -226,10 +226,10 @@ def _stiff(observed: _Observations, trusted: Tensor, error: Tensor, config: Guid
     ``trusted`` may be several sets of weights, as for ``solve_robust``. A residual counts half at
     ``outlier_width`` standard deviations of match and prior together.
     """
-    width = config.outlier_width * (observed.noise**2 + error**2).sqrt()
     stiff = error.new_full((1, len(error), 1, 1, 1), STIFF_SMOOTHNESS)
     inertia = error.new_full((1, len(error), 1, 1, 1), STIFF_INERTIA * STIFF_SMOOTHNESS)
-    system = RobustSystem(observed.residual, trusted, width, observed.links, stiff, inertia)
+    of_data = observed.residual, trusted, observed.noise
+    system = RobustSystem(*of_data, error, config.outlier_width, observed.links, stiff, inertia)
     return solve_robust(system, REWEIGHTINGS + 1, SOLVER_STEPS)
 
 
@@ -310,8 +310,8 @@ def fit_depth(
     observed = _observations(depth_m, target, left_01, config)
     error = _on_grid(error, target.size)
     trusted = _stiff(observed, observed.weight, error, config).weights
-    width = RESIDUAL_CAUCHY * observed.noise
-    system = RobustSystem(observed.residual, trusted, width, observed.links, *_levels(error, config))
+    of_data, levels = (observed.residual, trusted, observed.noise), _levels(error, config)
+    system = RobustSystem(*of_data, None, RESIDUAL_CAUCHY, observed.links, *levels)
     total, _, decided = solve_robust(system, REWEIGHTINGS, SOLVER_STEPS, with_support=True)
     assert decided is not None  # it was asked for
     size = image_size(depth_m)

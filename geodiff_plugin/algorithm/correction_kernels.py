@@ -92,7 +92,7 @@ def edge_links(guide: Tensor, log_depth: Tensor) -> tuple[Tensor, Tensor]:
     return across, down
 
 
-@triton.jit(do_not_specialize=["n", "steps"])
+@triton.jit(do_not_specialize=["n", "steps"], do_not_specialize_on_alignment=["residual", "noise", "weight"])
 def observe_kernel(
     log_depth, matched, confidence, plane_step, residual, noise, weight, n, steps, match_noise,
     BLOCK: tl.constexpr,
@@ -114,7 +114,7 @@ def observe_kernel(
 def residuals(log_depth: Tensor, target: Matches, match_noise: float) -> tuple[Tensor, Tensor, Tensor]:
     """``correction._residuals`` by a kernel."""
     batch, n = len(log_depth), log_depth[0].numel()
-    residual, noise, weight = (torch.empty_like(log_depth) for _ in range(3))
+    residual, noise, weight = log_depth.new_empty(3, *log_depth.shape).unbind()
     launched_on(log_depth, observe_kernel[(triton.cdiv(n, BLOCK), batch)])(
         log_depth, target.inverse_depth.contiguous(), target.confidence.contiguous(), target.plane_step,
         residual, noise, weight, n, target.plane_step.numel(), match_noise, BLOCK=BLOCK,
@@ -148,7 +148,7 @@ def _quantile(values, weight, share, n, every, CHUNK: tl.constexpr):
     return reached.to(tl.float32, bitcast=True)
 
 
-@triton.jit(do_not_specialize=["n", "every"])
+@triton.jit(do_not_specialize=["n", "every"], do_not_specialize_on_alignment=["residual", "noise", "weight"])
 def spread_kernel(residual, noise, weight, confidence, spread, n, every, CHUNK: tl.constexpr):
     """``_spread`` of a sample."""
     sample = tl.program_id(0)
@@ -181,7 +181,7 @@ def spread(residual: Tensor, noise: Tensor, weight: Tensor, confidence: Tensor) 
     return found
 
 
-@triton.jit(do_not_specialize=["count"])
+@triton.jit(do_not_specialize=["count"], do_not_specialize_on_alignment=["smoothness", "inertia"])
 def levels_kernel(error, smoothness, inertia, count, reference_smoothness, BLOCK: tl.constexpr):
     """``_levels`` of a block of errors."""
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -198,7 +198,7 @@ def levels_kernel(error, smoothness, inertia, count, reference_smoothness, BLOCK
 
 def levels(error: Tensor, config: GuidanceConfig) -> tuple[Tensor, Tensor]:
     """``correction._levels`` by a kernel."""
-    smoothness, inertia = (error.new_empty(correction.PASSES, *error.shape) for _ in range(2))
+    smoothness, inertia = error.new_empty(2, correction.PASSES, *error.shape).unbind()
     count = error.numel()
     launched_on(error, levels_kernel[(triton.cdiv(count, BLOCK),)])(
         error.contiguous(), smoothness, inertia, count, config.smoothness, BLOCK=BLOCK

@@ -46,10 +46,10 @@ GATHERED = tl.constexpr(256)
 #: As ``tiny`` of the reference: a channel that has converged stays where it is.
 TINY = tl.constexpr(1e-20)
 
-_TENSORS = ["data", "weight", "across", "down", "start", "cauchy", "smoothness", "inertia"]
+_TENSORS = ["data", "weight", "across", "down", "start", "noise", "doubt", "smoothness", "inertia"]
 _WRITTEN = ["field", "support", "weights", "scratch", "arrivals"]
 _SIZES = ["height", "width", "batch", "parts", "levels"]
-_COUNTS = ["most", "passes", "rounds", "first_steps", "steps", "given", "local"]
+_COUNTS = ["most", "passes", "rounds", "first_steps", "steps", "given", "local", "doubted"]
 
 
 @triton.jit
@@ -110,31 +110,21 @@ def _left_over(data, field, x, shared, sample, held, p, n):
 
 
 @triton.jit
-def _cauchy_weight(weight, cauchy, left_over, shared, sample, p, n):
-    """The weight of observations in the next round."""
-    ratio = left_over / tl.load(cauchy + shared * n + p, p < n, 1.0)
+def _cauchy_weight(weight, noise, doubt, reach, doubted, left_over, shared, sample, p, n):
+    """The weight of observations in the next round; a doubt is nothing (0), a sample's (1), a pixel's (2)."""
+    deviation = tl.load(noise + shared * n + p, p < n, 1.0)
+    of_pixel = doubted // 2
+    of_fitted = tl.load(doubt + shared * (1 + (n - 1) * of_pixel) + p * of_pixel, p < n, 0.0)
+    of_fitted = tl.where(doubted > 0, of_fitted, 0.0)
+    ratio = left_over / (reach * tl.sqrt(deviation * deviation + of_fitted * of_fitted))
     return tl.load(weight + sample * n + p, p < n, 0.0) / (1.0 + ratio * ratio)
 
 
 @triton.jit
 def _robust_tile(
-    data,
-    weight,
-    cauchy,
-    inertia,
-    field,
-    system,
-    shared,
-    sample,
-    p,
-    part,
-    turn,
-    n,
-    batch,
-    channels,
-    most,
-    local,
-):
+    data, weight, noise, doubt, reach, doubted, inertia, field, system, shared, sample, p, part, turn, n,
+    batch, channels, most, local,
+):  # fmt: skip
     """Weight and pull of a round of a pass; a pass begins with what the ones before have left of the data."""
     inside, own = p < n, sample * n + p
     weights, done = tl.load(weight + own, inside, 0.0), tl.zeros_like(p).to(tl.float32)
@@ -143,7 +133,7 @@ def _robust_tile(
         held = tl.where(turn > 0, channels, 1)
         x = system + (3 + most) * batch * n
         u, done, left_over = _left_over(data, field, x, shared, sample, held, p, n)
-        weights = _cauchy_weight(weight, cauchy, left_over, shared, sample, p, n)
+        weights = _cauchy_weight(weight, noise, doubt, reach, doubted, left_over, shared, sample, p, n)
         done += tl.where(turn > 0, 0.0, u)
     if turn == 0:
         tl.store(field + own, done, inside)
@@ -411,13 +401,15 @@ def _coarsen(scratch, arrivals, expected, height, width, batch, channels, stored
 
 @triton.jit
 def _finish_tile(
-    data, weight, cauchy, x, field, support, weights, shared, sample, p, n, most, ROBUST: tl.constexpr
-):
+    data, weight, noise, doubt, reach, doubted, x, field, support, weights, shared, sample, p, n, most,
+    ROBUST: tl.constexpr,
+):  # fmt: skip
     """What a launch returns."""
     inside, own = p < n, sample * n + p
     if ROBUST:
         u, done, left_over = _left_over(data, field, x, shared, sample, most, p, n)
-        tl.store(weights + own, _cauchy_weight(weight, cauchy, left_over, shared, sample, p, n), inside)
+        found = _cauchy_weight(weight, noise, doubt, reach, doubted, left_over, shared, sample, p, n)
+        tl.store(weights + own, found, inside)
         tl.store(field + own, done + u, inside)
         if most > 1:
             decided = tl.load(x + (sample * most + 1) * n + p, inside, 0.0, cache_modifier=".cg")
@@ -430,9 +422,9 @@ def _finish_tile(
 
 @triton.jit(do_not_specialize=_SIZES + _COUNTS, do_not_specialize_on_alignment=_TENSORS + _WRITTEN)
 def solve_kernel(
-    data, weight, across, down, start, cauchy, smoothness, inertia,
-    field, support, weights, scratch, arrivals,
-    height, width, batch, parts, levels, most, passes, rounds, first_steps, steps, given, local,
+    data, weight, across, down, start, noise, doubt, smoothness, inertia,
+    field, support, weights, scratch, arrivals, reach,
+    height, width, batch, parts, levels, most, passes, rounds, first_steps, steps, given, local, doubted,
     ROBUST: tl.constexpr, TILE: tl.constexpr, ALONE: tl.constexpr,
 ):  # fmt: skip
     """All passes of ``solve_robust``, or ``solve_field``, whose ``weight`` and pull ``data`` are given.
@@ -457,8 +449,8 @@ def solve_kernel(
             )  # fmt: skip
             if ROBUST:
                 _robust_tile(
-                    data, weight, cauchy, inertia + of_pass, field, scratch, shared, sample, p, part, again,
-                    n, batch, channels, most, local,
+                    data, weight, noise, doubt, reach, doubted, inertia + of_pass, field, scratch, shared,
+                    sample, p, part, again, n, batch, channels, most, local,
                 )  # fmt: skip
             else:
                 _given_tile(data, weight, start, scratch, sample, p, n, batch, channels, given)
@@ -480,7 +472,10 @@ def solve_kernel(
     for tile in range(first, tiles * batch, programs):
         sample, p = tile // tiles, (tile % tiles) * TILE + tl.arange(0, TILE)
         shared = sample % parts
-        _finish_tile(data, weight, cauchy, x, field, support, weights, shared, sample, p, n, most, ROBUST)
+        _finish_tile(
+            data, weight, noise, doubt, reach, doubted, x, field, support, weights, shared, sample, p, n,
+            most, ROBUST,
+        )  # fmt: skip
 
 
 @functools.cache
@@ -499,7 +494,8 @@ class _Read(NamedTuple):
     across: Tensor  # (parts, 1, H, W - 1)
     down: Tensor  # (parts, 1, H - 1, W)
     start: Tensor  # as the field
-    cauchy: Tensor  # (parts, 1, H, W)
+    noise: Tensor  # (parts, 1, H, W)
+    doubt: Tensor  # (parts, 1, 1, 1), or (parts, 1, H, W)
     smoothness: Tensor  # (passes, parts, 1, H, W), or of pixels (1, 1)
     inertia: Tensor  # as smoothness
 
@@ -514,6 +510,7 @@ class _Counts(NamedTuple):
     steps: int
     given: bool  # whether ``start`` is
     local: bool  # whether there is a smoothness per pixel
+    doubted: int = 0  # as ``_cauchy_weight`` has it
 
 
 def _sizes(height: int, width: int, levels: bool) -> list[tuple[int, int]]:
@@ -530,8 +527,10 @@ def _scratch_size(batch: int, fields: int, pixels: Sequence[int]) -> int:
     return stored + fields * (WORK_ARRAYS.value * pixels[0] + SUMS.value * triton.cdiv(pixels[0], TILE))
 
 
-def _launch(read: _Read, written: tuple[Tensor, Tensor, Tensor], counts: _Counts, robust: bool) -> None:
-    """``solve_kernel`` into field, support and weights; the latter two are those of ``robust`` solves."""
+def _launch(
+    read: _Read, written: tuple[Tensor, Tensor, Tensor], counts: _Counts, reach: float | None = None
+) -> None:
+    """``solve_kernel`` into field, support and weights; the latter two, and ``reach``, are robust solves'."""
     batch, _, height, width = read.weight.shape
     pixels = [rows * columns for rows, columns in _sizes(height, width, not counts.given)]
     fields = batch * counts.channels
@@ -542,9 +541,9 @@ def _launch(read: _Read, written: tuple[Tensor, Tensor, Tensor], counts: _Counts
     if scratch.is_cuda:  # the interpreter knows neither
         options |= {"maxnreg": MOST_REGISTERS, "launch_cooperative_grid": True}
     launched_on(scratch, solve_kernel[(min(tiles, _most_programs(scratch.device)),)])(
-        *read, *written, scratch, arrivals,
+        *read, *written, scratch, arrivals, 1.0 if reach is None else reach,
         height, width, batch, len(read.across), len(pixels), *map(int, counts),
-        ROBUST=robust, TILE=TILE, ALONE=ALONE, **options,
+        ROBUST=reach is not None, TILE=TILE, ALONE=ALONE, **options,
     )  # fmt: skip
 
 
@@ -567,8 +566,8 @@ def solve_field(system: FieldSystem, steps: int, start: Tensor | None) -> Tensor
     first = pull if start is None else start.contiguous()
     counts = _Counts(channels, 1, 1, solver.COARSEST_STEPS, steps, start is not None, local=False)
     unused = pull
-    read = _Read(pull, weight, across, down, first, unused, unused, unused)
-    _launch(read, (field, unused, unused), counts, robust=False)
+    read = _Read(pull, weight, across, down, first, unused, unused, unused, unused)
+    _launch(read, (field, unused, unused), counts)
     return field
 
 
@@ -576,11 +575,15 @@ def solve_robust(system: RobustSystem, rounds: int, steps: int, with_support: bo
     """``solver.solve_robust`` by the kernel."""
     data, trusted = system.data.contiguous(), system.trusted.contiguous()
     parts, (across, down) = len(data), (_of_batch(link, len(data)) for link in system.links)
-    field, weights = torch.empty_like(trusted), torch.empty_like(trusted)
-    support = torch.empty_like(trusted) if with_support else None
+    field, weights, *supports = trusted.new_empty(2 + with_support, *trusted.shape).unbind()
+    support = supports[0] if with_support else None
     stiffness, inertia = (_of_batch(part, parts, axis=1) for part in (system.smoothness, system.inertia))
-    read = _Read(data, trusted, across, down, data, system.width.contiguous(), stiffness, inertia)
+    noise, doubt, doubted = system.noise.contiguous(), data, 0
+    if system.doubt is not None:
+        doubt = _of_batch(system.doubt, parts)
+        doubted = 1 if doubt.shape[-2:] == (1, 1) else 2
+    read = _Read(data, trusted, across, down, data, noise, doubt, stiffness, inertia)
     local, channels = stiffness.shape[-2:] != (1, 1), 1 + with_support
-    counts = _Counts(channels, len(stiffness), rounds, solver.COARSEST_STEPS, steps, False, local)
-    _launch(read, (field, weights if support is None else support, weights), counts, robust=True)
+    counts = _Counts(channels, len(stiffness), rounds, solver.COARSEST_STEPS, steps, False, local, doubted)
+    _launch(read, (field, weights if support is None else support, weights), counts, system.reach)
     return RobustField(field, weights, support)

@@ -121,7 +121,9 @@ class RobustSystem:
         data: ``r (B, 1, H, W)``.
         trusted: ``t (B, 1, H, W)``, the weight of an observation that is met. Of ``n B`` samples it is ``n``
             sets of weights, one after the other, for the same observations.
-        width: ``w (B, 1, H, W)``, the residual at which an observation counts half.
+        noise: ``(B, 1, H, W)`` standard deviation of an observation.
+        doubt: ``(B, 1, 1, 1)`` or ``(B, 1, H, W)``, that of what is fitted to them; ``None`` is 0.
+        reach: ``w`` is so many times the two deviations together: there an observation counts half.
         links: ``g``, across and down as in ``FieldSystem``.
         smoothness: ``a`` of every pass, ``(P, B, 1, 1, 1)``, or ``(P, B, 1, H, W)``: between two pixels the
             lower one of both holds.
@@ -130,10 +132,18 @@ class RobustSystem:
 
     data: Tensor
     trusted: Tensor
-    width: Tensor
+    noise: Tensor
+    doubt: Tensor | None
+    reach: float
     links: tuple[Tensor, Tensor]
     smoothness: Tensor
     inertia: Tensor
+
+    @property
+    def width(self) -> Tensor:
+        """``w (B, 1, H, W)``."""
+        both = self.noise if self.doubt is None else (self.noise**2 + self.doubt**2).sqrt()
+        return self.reach * both
 
 
 class RobustField(NamedTuple):

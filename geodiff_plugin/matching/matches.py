@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin._kernels import launch_bound
+from geodiff_plugin._kernels import launch_bound, use_kernel
 from geodiff_plugin.geometry import NEAREST_M, project, stacked
 
 #: The unit in which errors at points are measured, as a share of their median inverse depth.
@@ -186,6 +186,11 @@ def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
     One-sided: a reflection and what is seen through glass lie behind the surface, never before it. A prior
     that is right to 5 % can tell a reflection; a prior that errs by 30 % cannot.
     """
+    radius = max(1, round(REGION * max(depth_m.shape[-2:])))
+    if use_kernel(depth_m) and depth_m.numel() < MOST_SORTED:
+        from geodiff_plugin.matching import reflection_kernels as kernels
+
+        return kernels.reject_reflections(matches, depth_m, radius)
     weight = matches.confidence.float()
     behind = -(matches.inverse_depth * depth_m).clamp_min(1e-6).log().clamp(-LARGEST, LARGEST)
     counted = torch.where(weight > SPREAD_CONFIDENCE, behind, torch.full_like(behind, torch.nan)).flatten(1)
@@ -194,7 +199,6 @@ def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
     spread = apart.nanquantile(SPREAD_SHARE, 1) / NORMAL_QUANTILE
     spread = spread.nan_to_num(LARGEST).clamp_min(SPREAD_FLOOR)
     least = (SPREADS * spread).clamp_min(LEAST_DISTANCE)[:, None, None, None]
-    radius = max(1, round(REGION * max(depth_m.shape[-2:])))
     behind_in_region, in_region = _window_sum(torch.cat([behind * weight, weight], 1), radius).chunk(2, 1)
     region = behind_in_region / in_region.clamp_min(1.0)
     rejected = ((torch.minimum(region, behind) / least - 1.0) / (MULTIPLE - 1.0)).clamp(0.0, 1.0)

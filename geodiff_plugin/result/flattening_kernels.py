@@ -26,7 +26,7 @@ def _slope(inverse, at, away, linked):
     return tl.load(inverse + at + away, linked, 0.0) - tl.load(inverse + at, linked, 0.0)
 
 
-@triton.jit(do_not_specialize=["height", "width"])
+@triton.jit(do_not_specialize=["height", "width"], do_not_specialize_on_alignment=["weight", "pull"])
 def slopes_kernel(inverse, known, across, down, weight, pull, height, width, BLOCK: tl.constexpr):
     """Weight and pull of the slopes across and down, as ``_smoothed`` makes them, of a block of pixels."""
     n, p = height * width, tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -68,7 +68,7 @@ def forces_kernel(inverse, smoothed, across, down, pull, height, width, BLOCK: t
 def slopes(inverse: Tensor, known: Tensor, links: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Weight and pull ``(2, 1, h, w)`` of the slopes across and down of a map ``(1, 1, h, w)``."""
     height, width = inverse.shape[-2:]
-    weight, pull = (inverse.new_empty(2, 1, height, width) for _ in range(2))
+    weight, pull = inverse.new_empty(2, 2, 1, height, width).unbind()
     launched_on(inverse, slopes_kernel[(triton.cdiv(height * width, BLOCK),)])(
         inverse, known.contiguous(), *links, weight, pull, height, width, BLOCK=BLOCK
     )

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin._strips import row_strips
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.geometry import constant_like, image_size, is_rectified
@@ -33,6 +34,8 @@ REACH_PX = 3
 FEWEST_MATCHES = 40
 #: Upper bound on the values that are sorted for a quantile; torch's own is four times as many.
 MOST_SORTED = 1 << 22
+#: Quantiles of inverse depth that are the ends of a scene.
+ENDS = (0.05, 0.95)
 #: Log of the ratio of the 95 % and the 5 % quantile of depth below which a scene may be one plane.
 FLAT = 0.2
 #: A point that differs from the matches by this factor contradicts them (log).
@@ -110,20 +113,32 @@ def _measure_points(matches: Matches, points: Matches) -> dict[str, Tensor]:
 
 def _measure_matches(matches: Matches, depth_m: Tensor, planes: Tensor | None) -> dict[str, Tensor]:
     """Share matched, spread of the depths, deviation of the result, share on the first or last plane."""
+    resized = F.interpolate(depth_m.float(), matches.size, mode="nearest-exact")[0]
+    numbers = _of_matches_and_depth(matches, resized)
+    if planes is not None:
+        in_front = (matches.confidence > CONFIDENT) & (matches.inverse_depth > 0)
+        off = ((matches.inverse_depth - planes[end]).abs() for end in (0, -1))
+        first, last = (in_front & (each < 0.75 * matches.plane_step) for each in off)
+        numbers["at_end"] = (first | last).sum() / in_front.sum().clamp_min(1)
+    return numbers
+
+
+def _of_matches_and_depth(matches: Matches, depth_m: Tensor) -> dict[str, Tensor]:
+    """What of ``_measure_matches`` every image has, for ``depth_m (1, H, W)`` on the grid of the matches."""
+    every = max(1, depth_m.numel() // MOST_SORTED)
+    if use_kernel(depth_m) and every == 1:
+        from geodiff_plugin.result import indicator_kernels as kernels
+
+        return kernels.of_matches(matches, depth_m)
     confident, step = matches.confidence > CONFIDENT, matches.plane_step
     in_front = confident & (matches.inverse_depth > 0)
-    inverse_depth = _where(matches.inverse_depth, in_front)
-    sample = inverse_depth.flatten()[:: max(1, inverse_depth.numel() // MOST_SORTED)]
-    low, high = torch.nanquantile(sample, constant_like(sample, 0.05, 0.95)).unbind()
+    sample = _where(matches.inverse_depth, in_front).flatten()[::every]
+    low, high = torch.nanquantile(sample, constant_like(sample, *ENDS)).unbind()
     numbers = {"matched": confident.float().mean(), "in_front": in_front.sum()}
     numbers |= {"spread": (high / low.clamp_min(1e-9)).log(), "planes_apart": (high - low) / step}
     numbers |= {"scene_m": 1.0 / sample.nanmedian()}
-    if planes is not None:
-        first, last = ((inverse_depth - planes[end]).abs() < 0.75 * step for end in (0, -1))
-        numbers["at_end"] = (first | last).sum() / in_front.sum().clamp_min(1)
     at = confident & (matches.inverse_depth > step)
-    resized = F.interpolate(depth_m.float(), matches.size, mode="nearest-exact")[0]
-    off = _where((resized * matches.inverse_depth).log().abs(), at)
+    off = _where((depth_m * matches.inverse_depth).log().abs(), at)
     return numbers | {"off_matches": off.flatten().nanmedian(), "off_where": at.sum()}
 
 

@@ -6,7 +6,6 @@ This module is imported only where ``use_kernel`` says so, because it imports Tr
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 import triton
@@ -16,7 +15,7 @@ from torch import Tensor
 from geodiff_plugin._kernels import launched_on
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale import points
-from geodiff_plugin.scale.space import FLOOR_EPS, KERNEL_FORMS, SQUARE, MetricMap
+from geodiff_plugin.scale.space import FLOOR_EPS, KERNEL_FORMS, SQUARE, AffineState, MetricMap
 
 # A kernel reads constants of its module only as these.
 _FIT_NOISE = tl.constexpr(points.FIT_NOISE)
@@ -105,9 +104,17 @@ def floored_of(x, CLIPPED: tl.constexpr):
 
 
 @triton.jit
+def _softplus(raw):
+    """``F.softplus``; the log of 1 + e, e small, by the ratio in which its rounding cancels."""
+    e = tl.exp(tl.minimum(raw, 20.0))
+    above = 1.0 + e
+    return tl.where(raw > 20.0, raw, tl.where(above == 1.0, e, tl.log(above) * (e / (above - 1.0))))
+
+
+@triton.jit
 def map_kernel(
     x, scale, shift, unit, made, pixels,
-    MAKES: tl.constexpr, FORM: tl.constexpr, CLIPPED: tl.constexpr, PIXELS: tl.constexpr,
+    MAKES: tl.constexpr, FORM: tl.constexpr, CLIPPED: tl.constexpr, RAW: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip
     """``smooth_floor``, ``MetricMap.__call__`` or ``MetricMap.relative``. Grid: blocks of pixels, maps."""
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
@@ -118,6 +125,8 @@ def map_kernel(
         value = floored_of(value, CLIPPED)
     else:
         s, t, g = tl.load(scale + of_map), tl.load(shift + of_map), tl.load(unit + of_map)
+        if RAW:
+            s, t = _softplus(s), _softplus(t)
         if MAKES == _METRIC:
             value = g * forward(s * floored_of(value, CLIPPED) + t, FORM)
         else:
@@ -307,9 +316,13 @@ def refine_kernel(
     tl.store(refined + tl.num_programs(0) + row, far)
 
 
-def _made(x: Tensor, numbers: Sequence[Tensor], makes: int, metric: MetricMap, batch: int = 1) -> Tensor:
-    """A map made of another one, of a ``batch`` of maps, whose scale, shift and unit are ``(B,)``."""
-    x = x.contiguous()
+def _made(x: Tensor, affine: AffineState | None, makes: int, metric: MetricMap) -> Tensor:
+    """Maps made of other ones, each with its scale, shift and global scale, if these are needed."""
+    x, batch, numbers, raw = x.contiguous(), 1, (x, x, x), False
+    if affine is not None:
+        raw, batch = affine.units is None, len(x)
+        both = (affine.s_hat, affine.t_hat) if raw else (affine.scale, affine.shift)
+        numbers = *both, affine.g_s
     made, pixels = torch.empty_like(x), x.numel() // batch
     launched_on(x, map_kernel[(triton.cdiv(pixels, PIXELS), batch)])(
         x,
@@ -319,6 +332,7 @@ def _made(x: Tensor, numbers: Sequence[Tensor], makes: int, metric: MetricMap, b
         MAKES=makes,
         FORM=KERNEL_FORMS[metric.space],
         CLIPPED=metric.positive == SQUARE,
+        RAW=raw,
         PIXELS=PIXELS,
     )
     return made
@@ -326,17 +340,17 @@ def _made(x: Tensor, numbers: Sequence[Tensor], makes: int, metric: MetricMap, b
 
 def floored(x: Tensor) -> Tensor:
     """``space.smooth_floor``."""
-    return _made(x, (x, x, x), FLOORED, MetricMap())
+    return _made(x, None, FLOORED, MetricMap())
 
 
-def metric_depth(x: Tensor, numbers: Sequence[Tensor], metric: MetricMap) -> Tensor:
-    """``MetricMap.__call__`` with scale, shift and global scale."""
-    return _made(x, numbers, METRIC, metric, len(x))
+def metric_depth(x: Tensor, affine: AffineState, metric: MetricMap) -> Tensor:
+    """``MetricMap.__call__``."""
+    return _made(x, affine, METRIC, metric)
 
 
-def relative(depth_m: Tensor, numbers: Sequence[Tensor], metric: MetricMap) -> Tensor:
-    """``MetricMap.relative`` with scale, shift and global scale."""
-    return _made(depth_m, numbers, RELATIVE, metric, len(depth_m))
+def relative(depth_m: Tensor, affine: AffineState, metric: MetricMap) -> Tensor:
+    """``MetricMap.relative``."""
+    return _made(depth_m, affine, RELATIVE, metric)
 
 
 def warps(block: int) -> int:

@@ -204,8 +204,9 @@ class MetricMap:
     def __post_init__(self) -> None:
         check_choice(self.space, "space", SPACES)
 
-    def _by_kernel(self, maps: Tensor, *numbers: Tensor) -> bool:
+    def _by_kernel(self, maps: Tensor, affine: AffineState) -> bool:
         """Whether maps, each with its scale, shift and global scale, are made by the kernel."""
+        numbers = affine.s_hat, affine.t_hat, affine.g_s
         is_one_each = all(number.shape == maps.shape[:1] for number in numbers)
         return self.space in KERNEL_FORMS and is_one_each and _by_kernel(maps, *numbers)
 
@@ -218,23 +219,21 @@ class MetricMap:
 
         Differentiable in ``x``, ``s_hat`` and ``t_hat``; linear in ``g_s``.
         """
-        numbers = affine.scale, affine.shift, affine.g_s
-        if self._by_kernel(x, *numbers):
+        if self._by_kernel(x, affine):
             from geodiff_plugin.scale import kernels
 
-            return kernels.metric_depth(x, numbers, self)
-        s, t, g = (v.view(-1, 1, 1, 1) for v in numbers)
+            return kernels.metric_depth(x, affine, self)
+        s, t, g = (v.view(-1, 1, 1, 1) for v in (affine.scale, affine.shift, affine.g_s))
         confined = self.confine(x) if self.positive == SQUARE else smooth_floor(x)
         return SPACES[self.space].forward(s * confined + t, g)
 
     def relative(self, depth_m: Tensor, affine: AffineState) -> Tensor:
         """The relative map of a metric depth ``(B, 1, H, W)``; inverse of the call, bounded below 0."""
-        numbers = affine.scale, affine.shift, affine.g_s
-        if self._by_kernel(depth_m, *numbers):
+        if self._by_kernel(depth_m, affine):
             from geodiff_plugin.scale import kernels
 
-            return kernels.relative(depth_m, numbers, self)
-        s, t, g = (v.view(-1, 1, 1, 1) for v in numbers)
+            return kernels.relative(depth_m, affine, self)
+        s, t, g = (v.view(-1, 1, 1, 1) for v in (affine.scale, affine.shift, affine.g_s))
         floored = (SPACES[self.space].inverse(depth_m / g) - t) / s
         if self.positive == SQUARE:
             return self.confine(floored)

@@ -26,10 +26,12 @@ from geodiff_plugin.algorithm import edge_kernels
 from geodiff_plugin.algorithm import kernels as algorithm
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.matching import kernels as matching
+from geodiff_plugin.matching import reflection_kernels as reflection
 from geodiff_plugin.matching.census import MARGIN_PX, SIDE, VOTE_LEVELS
 from geodiff_plugin.matching.consistency import EVERY_ROW
 from geodiff_plugin.result import exposure_kernels as exposure
 from geodiff_plugin.result import flattening_kernels as flattening
+from geodiff_plugin.result import indicator_kernels as indicator
 from geodiff_plugin.result import kernels as result
 from geodiff_plugin.runtime import kernels as runtime
 from geodiff_plugin.scale import kernels as scale
@@ -37,8 +39,8 @@ from geodiff_plugin.scale import search_kernels as search
 from geodiff_plugin.scale.points import BASIN_CANDIDATES
 from geodiff_plugin.scale.space import KERNEL_FORMS
 
-#: Compute capabilities of an A100 and of an H100.
-ARCHITECTURES = (80, 90)
+#: Compute capabilities of an A100, of an H100 and of GeForce RTX 50.
+ARCHITECTURES = (80, 90, 120)
 #: Registers of a multiprocessor, on all of these.
 REGISTERS = 65_536
 _CUOBJDUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
@@ -60,6 +62,7 @@ class Compiled:
 def launches() -> Iterator[Compiled]:
     """Every kernel, at the largest sizes that are usual."""
     yield from _of_the_matching()
+    yield from _of_the_matches()
     yield from _of_the_solver()
     yield from _of_the_fit()
     yield from _of_the_flattening()
@@ -97,6 +100,19 @@ def _of_the_matching() -> Iterator[Compiled]:
     weigh = 7 * "*fp32 " + "*i1 *fp32" + 8 * " i32" + 3 * " fp32"
     sizes = pixels | {"FIRST": False, "HAS_VALID": True, "EVERY_ROW": EVERY_ROW}
     yield Compiled("evidence of a right view", matching.weigh_kernel, weigh, sizes, 4, exact)
+
+
+def _of_the_matches() -> Iterator[Compiled]:
+    block = {"BLOCK": reflection.BLOCK}
+    yield Compiled("distance behind a map", reflection.behind_kernel, 5 * "*fp32 " + "i32", block, 4)
+    yield Compiled("spread of matches", reflection.spread_kernel, "*fp32 *fp32 i32", {}, 1)
+    rows = 4 * "*fp32 " + 3 * "i32 "
+    yield Compiled("sums of rows", reflection.rows_kernel, rows, block, 4)
+    remaining = 5 * "*fp32 " + 4 * "i32 "
+    yield Compiled("what remains of matches", reflection.remaining_kernel, remaining, block, 4)
+    marked = 6 * "*fp32 " + "i32"
+    yield Compiled("matches to sort", indicator.marked_kernel, marked, {"BLOCK": indicator.BLOCK}, 4)
+    yield Compiled("numbers of matches", indicator.numbers_kernel, 4 * "*fp32 " + "i32", {}, 1)
 
 
 def _of_the_networks() -> Iterator[Compiled]:
@@ -147,7 +163,8 @@ def _of_the_scale() -> Iterator[Compiled]:
         sizes = {"FORM": KERNEL_FORMS["depth"], "BLOCK": block, "CHUNK": scale.CHUNK}
         yield Compiled(f"refinement, {block} matches", scale.refine_kernel, refine, sizes, scale.warps(block))
 
-    sizes = {"MAKES": scale.RELATIVE, "FORM": KERNEL_FORMS["log1p"], "CLIPPED": False, "PIXELS": scale.PIXELS}
+    sizes = {"MAKES": scale.RELATIVE, "FORM": KERNEL_FORMS["log1p"], "CLIPPED": False, "RAW": True}
+    sizes |= {"PIXELS": scale.PIXELS}
     yield Compiled("metric and relative maps", scale.map_kernel, 5 * "*fp32 " + "i32", sizes, 4)
     sizes = {"FORM": KERNEL_FORMS["depth"], "CLIPPED": False, "GRID": BASIN_CANDIDATES, "BLOCK": search.BLOCK}
     basin = "*fp32 *i64 " + 8 * "*fp32 " + 7 * "i32 "
@@ -163,7 +180,7 @@ def _of_the_scale() -> Iterator[Compiled]:
 
 
 def _of_the_solver() -> Iterator[Compiled]:
-    solve = 12 * "*fp32 " + "*i32" + 12 * " i32"
+    solve = 13 * "*fp32 " + "*i32 fp32" + 13 * " i32"
     options = {"maxnreg": algorithm.MOST_REGISTERS, "launch_cooperative_grid": True}
     for robust, name in ((False, "fields"), (True, "robust fields")):
         sizes = {"ROBUST": robust, "TILE": algorithm.TILE, "ALONE": algorithm.ALONE}

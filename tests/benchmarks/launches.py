@@ -65,6 +65,8 @@ WITH_KERNELS = (
     "_warped",
     "_photometric_error",
     "depth_confidence",
+    "reject_reflections",
+    "_of_matches_and_depth",
 )
 #: Functions, and methods as ``Class.method``, whose operations are shown apart; each without those below it.
 STAGES = (

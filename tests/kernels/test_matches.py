@@ -1,0 +1,86 @@
+"""Kernels that judge matches, against their references: reflections, and what indicators say of matches."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from geodiff_plugin._kernels import without_kernels
+from geodiff_plugin.matching import Matches, matches, reject_reflections
+from geodiff_plugin.result.indicators import _of_matches_and_depth
+from tests.kernels.drawn import drawn
+
+SIZES = st.tuples(st.integers(1, 40), st.integers(1, 40))
+
+
+def random_matches(seed: int, batch: int, size: tuple[int, int], device: torch.device) -> Matches:
+    """Matches ``(B, 1, h, w)`` of depths around 3 m, a patch of which lies far behind; some at infinity."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def rand() -> torch.Tensor:
+        return torch.rand(batch, 1, *size, generator=generator)
+
+    inverse = (0.25 + 0.1 * rand()) * (rand() > 0.1)
+    inverse[..., : size[0] // 2, : size[1] // 3] *= 0.3
+    confidence = torch.where(rand() > 0.3, rand(), 0.0)
+    return Matches(*(part.to(device) for part in (inverse, confidence, torch.full((batch,), 0.01))))
+
+
+@drawn(6)
+@given(seed=st.integers(0, 999), batch=st.integers(1, 2), size=SIZES, factor=st.sampled_from([0.0, 0.6, 1.0]))
+@example(seed=0, batch=2, size=(31, 37), factor=1.0)
+@example(seed=1, batch=2, size=(5, 3), factor=0.0)  # no match counts
+def test_what_remains_of_reflections(device, seed, batch, size, factor):
+    found = random_matches(seed, batch, size, device)
+    found = Matches(found.inverse_depth, factor * found.confidence, found.plane_step)
+    depth_m = 2.8 + 0.4 * torch.rand(batch, 1, *size, generator=torch.Generator().manual_seed(seed))
+    share = reject_reflections(found, depth_m.to(device))
+    with without_kernels():
+        expected = reject_reflections(found, depth_m.to(device))
+    torch.testing.assert_close(share, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_reflection_is_rejected_by_the_kernel_as_well(device):
+    size = 30, 45
+    inverse = torch.full((2, 1, *size), 0.3, device=device)
+    inverse[1, :, 10:22, 12:27] = 0.1
+    of_both = Matches(inverse, torch.full_like(inverse, 0.9), torch.full((2,), 0.01, device=device))
+    share = reject_reflections(of_both, torch.full_like(inverse, 1.0 / 0.3))
+    assert (share[0] == 1.0).all() and share[1, 0, 15, 20] == 0.0 and share[1, 0, 0, 0] == 1.0
+
+
+@drawn(8)
+@given(seed=st.integers(0, 999), size=SIZES, least=st.sampled_from([0.0, 0.5, 0.97, 1.0]))
+@example(seed=0, size=(31, 37), least=0.5)
+@example(seed=1, size=(4, 5), least=1.0)  # no match
+@example(seed=2, size=(1, 1), least=0.0)
+def test_numbers_of_matches(device, seed, size, least):
+    found = random_matches(seed, 1, size, device)
+    confidence = torch.where(found.confidence >= least, found.confidence, 0.0)
+    of_image = Matches(found.inverse_depth[0], confidence[0], found.plane_step[0])
+    depth_m = 2.8 + 0.4 * torch.rand(1, *size, generator=torch.Generator().manual_seed(seed))
+    numbers = _of_matches_and_depth(of_image, depth_m.to(device))
+    with without_kernels():
+        expected = _of_matches_and_depth(of_image, depth_m.to(device))
+    assert numbers.keys() == expected.keys()
+    for name, value in expected.items():
+        exactly = name in ("matched", "in_front", "off_where")
+        assert float(numbers[name]) == pytest.approx(
+            float(value), rel=0.0 if exactly else 1e-5, abs=0.0 if exactly else 1e-6, nan_ok=True
+        ), name
+
+
+def test_more_values_than_are_sorted_are_left_to_the_reference(device, monkeypatch):
+    found, depth_m = random_matches(0, 1, (9, 8), device), torch.full((1, 1, 9, 8), 3.0, device=device)
+    monkeypatch.setattr(matches, "MOST_SORTED", 72)
+    monkeypatch.setattr("geodiff_plugin.result.indicators.MOST_SORTED", 36)
+    of_image = Matches(found.inverse_depth[0], found.confidence[0], found.plane_step[0])
+    both = []
+    for off in (False, True):
+        with without_kernels(off):
+            numbers = _of_matches_and_depth(of_image, depth_m[0])
+            both.append((reject_reflections(found, depth_m), *(float(each) for each in numbers.values())))
+    assert torch.equal(both[0][0], both[1][0])
+    assert all(math.isclose(one, other) for one, other in zip(both[0][1:], both[1][1:], strict=True))
