@@ -12,6 +12,7 @@ LAYER = {
     "_camera_checks": 0,
     "_certain": 0,
     "_checks": 0,
+    "_compilation": 0,
     "_kernels": 0,
     "_lazy": 0,
     "_reprojection": 0,

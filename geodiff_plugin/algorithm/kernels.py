@@ -537,13 +537,11 @@ def _launch(
     tiles = triton.cdiv(pixels[0], TILE) * fields
     scratch = read.data.new_empty(_scratch_size(batch, fields, pixels))
     arrivals = torch.zeros(1, dtype=torch.int32, device=scratch.device)
-    options = {"num_warps": WARPS}
-    if scratch.is_cuda:  # the interpreter knows neither
-        options |= {"maxnreg": MOST_REGISTERS, "launch_cooperative_grid": True}
     launched_on(scratch, solve_kernel[(min(tiles, _most_programs(scratch.device)),)])(
         *read, *written, scratch, arrivals, 1.0 if reach is None else reach,
         height, width, batch, len(read.across), len(pixels), *map(int, counts),
-        ROBUST=reach is not None, TILE=TILE, ALONE=ALONE, **options,
+        ROBUST=reach is not None, TILE=TILE, ALONE=ALONE,
+        num_warps=WARPS, maxnreg=MOST_REGISTERS, launch_cooperative_grid=True,
     )  # fmt: skip
 
 

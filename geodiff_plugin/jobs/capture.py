@@ -34,7 +34,7 @@ from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Record, Shard, sh
 from geodiff_plugin.jobs.lengths import KnownScale, check_lengths, known_scale, measure, spans_to_measure
 from geodiff_plugin.jobs.memory import fitting_memory
 from geodiff_plugin.jobs.options import OF_SCALE, CaptureOptions
-from geodiff_plugin.jobs.prior import graphs_for_many, load_quiet_prior, tell_of_compilation
+from geodiff_plugin.jobs.prior import compile_for, graphs_for_many, load_quiet_prior
 from geodiff_plugin.jobs.provenance import RECORD, SUMMARY, Provenance, begin_frames, check_poses
 from geodiff_plugin.jobs.report import messages_of, plain, read_report, single_map, verdict_report
 from geodiff_plugin.jobs.runner import Runner
@@ -375,7 +375,7 @@ def _depth_of_frames(
     _tell_of_poses(capture, scale, progress.tell)
     if options.poses_only:
         return {"unit": capture.unit, "poses": _pose_report(capture)} | _outcome([])
-    tell_of_compilation(options, pick_device(options.device), progress.tell)
+    compile_for(options, pick_device(options.device), progress.tell)
     frames = _run_frames(capture, options, names, RunKeys(poses_key, key, scale), progress.bar)
     outcome = _outcome(frames)
     if not Shard.of(options.shard).whole:

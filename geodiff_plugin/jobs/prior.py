@@ -10,9 +10,10 @@ from typing import Any
 import torch
 
 from geodiff_plugin._checks import bad_value
-from geodiff_plugin._kernels import compilation_ahead, without_kernels
+from geodiff_plugin._compilation import compile_kernels
+from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin.jobs.options import DepthOptions
-from geodiff_plugin.jobs.telling import Tell
+from geodiff_plugin.jobs.telling import Tell, silent
 from geodiff_plugin.options import SpeedOptions
 from geodiff_plugin.priors import find_prior
 from geodiff_plugin.priors.loading import no_bars
@@ -77,16 +78,14 @@ def graphs_for_many(options: SpeedOptions, device: torch.device) -> bool:
     return options.graphs or device.type == "cuda"
 
 
-def tell_of_compilation(options: SpeedOptions, device: torch.device, tell: Tell) -> None:
-    """Tell a line where the first picture of a job waits for kernels to be compiled."""
+def compile_for(options: SpeedOptions, device: torch.device, tell: Tell | None = None) -> None:
+    """Compile the kernels of a job's first picture, where Triton has not yet, and tell a line before."""
     with without_kernels(options.no_kernels):
-        if line := compilation_ahead(device):
-            tell(line)
+        compile_kernels(device, tell or silent)
 
 
 def prior_of_options(options: DepthOptions, device: torch.device, tell: Tell | None = None) -> Any:
     """``load_guided_prior`` as the options say."""
     pipe = load_quiet_prior(options.prior, device, options.space, options.dtype, options.option, tell)
-    if tell is not None:
-        tell_of_compilation(options, device, tell)
+    compile_for(options, device, tell)
     return enable_geometry_guidance(pipe, graphs=options.graphs, kernels=not options.no_kernels)

@@ -15,7 +15,8 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from geodiff_plugin._checks import bad_type, bad_value, check_choice, check_number, noted, refuse, warn
-from geodiff_plugin._kernels import compilation_ahead, without_kernels
+from geodiff_plugin._compilation import compile_kernels
+from geodiff_plugin._kernels import without_kernels
 from geodiff_plugin._threads import BackgroundTask
 from geodiff_plugin.algorithm.prompt import depth_prompt
 from geodiff_plugin.algorithm.schedule import count_steps
@@ -137,8 +138,7 @@ class GuidedCall(_Stock):
         if prior.deterministic and call["ensemble_size"] > 1:
             call |= _one_member(call)
         device = layers.device or super()._execution_device
-        if line := compilation_ahead(device):
-            logging.getLogger(__name__).info(line)
+        compile_kernels(device, logging.getLogger(__name__).info)
         call["image"] = lefts_01 = lefts_01.to(device)
         guidance.check_left_images(lefts_01)
         evidence = BackgroundTask(lambda: _prepared(guidance, lefts_01), device, own_stream=True)

@@ -183,7 +183,7 @@ class _Watching:
         return lambda *args, **kwargs: None
 
 
-class _Counting(_Watching, TorchDispatchMode):
+class Counting(_Watching, TorchDispatchMode):
     """Counts the operations of this thread into the stage that runs."""
 
     def __init__(self) -> None:
@@ -245,7 +245,7 @@ class _Clocking(_Watching):
 
 
 @contextmanager
-def _as_on_cuda(watching: _Counting | _Clocking, pipe: Any) -> Iterator[None]:
+def as_on_cuda(watching: Counting | _Clocking, pipe: Any) -> Iterator[None]:
     """Stages take the way that they take on CUDA, and are watched."""
     with ExitStack() as stack:
 
@@ -268,7 +268,7 @@ def _as_on_cuda(watching: _Counting | _Clocking, pipe: Any) -> Iterator[None]:
         yield
 
 
-def _guided_call(pipe: Any, side: int | None, **options: Any) -> Callable[[], object]:
+def guided_demo_call(pipe: Any, side: int | None, **options: Any) -> Callable[[], object]:
     """A guided call of the demo pair, resized to a longer side, by a pipeline with guidance enabled."""
     pipe.set_progress_bar_config(disable=True)
     pair = read_demo_pair()
@@ -287,9 +287,9 @@ def count_guided_call(resolution: int = 768, side: int | None = None) -> Counted
         resolution: longer side of what the prior works on, pixels.
         side: longer side of the photographs, pixels; ``None`` for the demo pair's own.
     """
-    pipe, counting = enable_geometry_guidance(random_marigold(width=0.01)), _Counting()
-    call = _guided_call(pipe, side, processing_resolution=resolution, num_inference_steps=4)
-    with _as_on_cuda(counting, pipe):
+    pipe, counting = enable_geometry_guidance(random_marigold(width=0.01)), Counting()
+    call = guided_demo_call(pipe, side, processing_resolution=resolution, num_inference_steps=4)
+    with as_on_cuda(counting, pipe):
         call()
     return counting.counted
 
@@ -301,10 +301,10 @@ def host_milliseconds(side: int = 160, repeats: int = 15) -> dict[str, float]:
     torch's operations take the time of their dispatch. What OpenCV does in threads of its own is not seen.
     """
     pipe = enable_geometry_guidance(load_bundled_prior())
-    call, taken = _guided_call(pipe, side), list[Counter[str]]()
+    call, taken = guided_demo_call(pipe, side), list[Counter[str]]()
     for _ in range(repeats + 1):
         clocking = _Clocking()
-        with _as_on_cuda(clocking, pipe):
+        with as_on_cuda(clocking, pipe):
             call()
         taken.append(clocking.milliseconds)
     return {stage: statistics.median(each[stage] for each in taken[1:]) for stage in (*STAGES, ELSEWHERE)}

@@ -88,7 +88,7 @@ def test_a_command_tells_it_before_its_first_picture(off, cache, monkeypatch):
 
 
 def test_a_call_logs_it(pipe, textured_plane, monkeypatch, caplog):
-    monkeypatch.setattr(guided_call, "compilation_ahead", lambda device: f"compiles on {device}")
+    monkeypatch.setattr(guided_call, "compile_kernels", lambda device, tell: tell(f"compiles on {device}"))
     with caplog.at_level(logging.INFO, "geodiff_plugin"):
         call_guided(pipe, textured_plane, num_inference_steps=1)
     assert [(r.levelno, r.message) for r in caplog.records if r.name.startswith("geodiff_plugin")] == [
