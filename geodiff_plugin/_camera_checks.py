@@ -124,8 +124,9 @@ def check_baseline(E: np.ndarray, name: str, unit: str | None) -> None:
         cure = "Without it two views do not tell the scale; give the distance between the cameras in metres."
         bad_value(name, expected, f"a translation of {baseline:.1g} m", cure)
     if unit == "m" and baseline > LONG_BASELINE_M:
-        cure = "If that is millimetres, divide E, or baseline_m (--baseline, --metres-per-unit), by 1000."
-        warn(Message("baseline.long", f"{name} has a baseline of {baseline:.4g} m. {cure}"))
+        cure = "divide its translation, or baseline_m (--baseline, --metres-per-unit), by 1000."
+        sentence = f"{name} has a baseline of {baseline:.4g} m. If that is millimetres, {cure}"
+        warn(Message("baseline.long", sentence))
 
 
 def check_metres(array: np.ndarray, name: str, got: str = "") -> None:

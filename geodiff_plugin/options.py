@@ -95,6 +95,16 @@ def imported(where: str) -> Any:
     return getattr(importlib.import_module(f"geodiff_plugin.{module}"), name)
 
 
+def on_ray(name: str) -> Any:
+    """A function of ``jobs.cluster``; ``InputError`` where Ray is not installed."""
+    try:
+        return imported(f"jobs.cluster.{name}")
+    except ModuleNotFoundError as error:
+        if error.name not in ("ray", "pyarrow"):
+            raise
+        refuse("--engine ray needs Ray, which is not installed. Run: pip install 'geodiff-plugin[ray]'.")
+
+
 def declare(
     default: Any,
     help_text: str,

@@ -183,4 +183,11 @@ def _value(field: dataclasses.Field[Any], rules: OptionRules, value: Any, kind: 
     try:
         return number(value)
     except ValueError:
-        bad_value(flag_of(field), NUMBERS[number], repr(value))
+        bad_value(flag_of(field), NUMBERS[number], repr(value), _cure_of_number(value))
+
+
+def _cure_of_number(typed: str) -> str:
+    """What to type instead of a decimal comma, or of a number with its unit."""
+    if "," in typed:
+        return "Decimals follow a point: 0.12."
+    return "Give the number alone; --help names its unit." if typed[:1].isdigit() else ""

@@ -70,7 +70,7 @@ def run_info(prior: str | None, space: str | None, knobs: bool) -> None:
     if prior is not None:
         with no_bars():
             described = _describe(find_prior(prior), space)
-    rows = [*versions().items(), ("device", f"cpu ({torch.get_num_threads()} threads)")]
+    rows = [*versions().items(), ("device", f"cpu (threads: {torch.get_num_threads()})")]
     for index in range(torch.cuda.device_count()):
         device = torch.cuda.get_device_properties(index)
         rows.append(("device", f"cuda:{index} ({device.name}, {device.total_memory / 2**30:.0f} GiB)"))

@@ -25,7 +25,7 @@ from geodiff_plugin.jobs.pairs import PairRef
 from geodiff_plugin.jobs.records import JobLog
 from geodiff_plugin.jobs.report import report_text, summary_line
 from geodiff_plugin.jobs.telling import Tell, collected_warnings, say, silent
-from geodiff_plugin.options import imported
+from geodiff_plugin.options import on_ray
 from geodiff_plugin.types import UNTESTED
 
 #: What to open first of a finished result.
@@ -68,7 +68,7 @@ def run_many(options: DepthOptions, refs: Sequence[PairRef]) -> None:
 def run_parquet(options: DepthOptions, refs: Sequence[PairRef]) -> None:
     """Many pairs into Parquet files, by Ray; the answer is what it comes to."""
     with collected_warnings():
-        to_parquet = imported("jobs.cluster.pairs_to_parquet")
+        to_parquet = on_ray("pairs_to_parquet")
         result = to_parquet(options, refs, progress=not options.quiet)
     if options.json:
         print(json.dumps(asdict(result), indent=2))

@@ -24,7 +24,7 @@ from geodiff_plugin.evaluation.tables import Table, cell, count_of_pairs, mean_c
 from geodiff_plugin.jobs.failures import Failures
 from geodiff_plugin.jobs.journal import Item, Journal, Record, Shard
 from geodiff_plugin.jobs.telling import silent
-from geodiff_plugin.options import imported
+from geodiff_plugin.options import on_ray
 from geodiff_plugin.priors import PRIORS, find_prior
 
 
@@ -76,7 +76,7 @@ def remarks_on(records: Sequence[Record], options: PairsOptions) -> list[str]:
 
 def _measure_on_ray(refs: Sequence[SampleRef], options: DirOptions) -> None:
     """Measure the cells without a record by Ray; this process tries those that fail there, and tells why."""
-    items_on_actors = imported("jobs.cluster.items_on_actors")
+    items_on_actors = on_ray("items_on_actors")
     cells = {cell.key: cell for cell in pair_cells(refs, options.methods, options)}
     make = partial(_cells_by_key, options, modules_of_datasets())
     with Journal(options.out / experiment.RECORDS_NAME) as journal:

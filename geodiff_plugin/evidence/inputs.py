@@ -265,7 +265,9 @@ def split_views(views: Any, *, cropped: bool = False) -> SplitViews:
     form = "a list [(image, K, E), ...] with the left view first"
     if not isinstance(views, (list, tuple)):
         bad_type("views", form, views)
-    if len(views) < 2 or not all(isinstance(view, (list, tuple)) and len(view) == 3 for view in views):
+    if len(views) < 2:
+        bad_value("views", f"{form}, two at least", str(len(views)), "One view alone does not tell metres.")
+    if not all(isinstance(view, (list, tuple)) and len(view) == 3 for view in views):
         kinds = [len(v) if isinstance(v, (list, tuple)) else type(v).__name__ for v in views]
         bad_value("views", form, f"{len(views)} entries of lengths {kinds}", "Give three values a view.")
     images, Ks, Es = (tuple(column) for column in zip(*views, strict=True))

@@ -263,7 +263,8 @@ def read_matrix(path: PathLike, name: str = "matrix") -> np.ndarray:
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])
     if matrix.shape not in ((3, 3), (4, 4)):
-        bad_value(name, MATRIX, f"{path} of shape {matrix.shape}")
+        cure = "Are these fx fy cx cy? K is three rows: fx 0 cx, 0 fy cy, 0 0 1." if matrix.size == 4 else ""
+        bad_value(name, MATRIX, f"{path} of shape {matrix.shape}", cure)
     if not np.isfinite(matrix).all():
         bad_value(name, "finite", f"NaN or infinity in {path}")
     return matrix

@@ -42,7 +42,7 @@ from geodiff_plugin.jobs.stopping import ending_with_parent
 from geodiff_plugin.jobs.telling import Tell, collected_warnings, say, silent
 from geodiff_plugin.jobs.writing import write_maps
 from geodiff_plugin.messages import Message, as_records
-from geodiff_plugin.options import imported
+from geodiff_plugin.options import on_ray
 from geodiff_plugin.pose.multiview import SolvedCapture
 from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from geodiff_plugin.runtime.machine import pick_device
@@ -230,7 +230,7 @@ def _frames_on_ray(
     options: CaptureOptions, items: Sequence[Item], keys: RunKeys, progress: bool
 ) -> list[Record]:
     """The frames by actors of Ray, each of which opens the capture and its poses."""
-    items_on_actors = imported("jobs.cluster.items_on_actors")
+    items_on_actors = on_ray("items_on_actors")
     make = partial(_frame_by_name, replace(options, overwrite=False), keys)
     with Journal(options.out / JOURNAL) as journal:
         for item in items:

@@ -34,7 +34,7 @@ from geodiff_plugin.jobs.tables import write_table
 from geodiff_plugin.jobs.telling import Tell, silent
 from geodiff_plugin.jobs.views import Views
 from geodiff_plugin.jobs.writing import write_row
-from geodiff_plugin.options import imported
+from geodiff_plugin.options import on_ray
 from geodiff_plugin.runtime.machine import pick_device
 
 #: What became of every pair.
@@ -237,7 +237,7 @@ def depth_pairs(
         there = _rows_there(items, options, journal)
         with _nothing_left_if_all_fail(journal):
             if options.engine == "ray":
-                pairs_to_folders = imported("jobs.cluster.pairs_to_folders")
+                pairs_to_folders = on_ray("pairs_to_folders")
                 records = pairs_to_folders(options, items, journal, progress=progress)
             else:
                 left = sum(journal.get(item) is None for item in items)

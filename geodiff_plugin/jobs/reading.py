@@ -243,7 +243,7 @@ def read_rig(
         K_right = K if options.k_right is None else _read_K(options.k_right, "--K-right")
         E = np.eye(4) if options.e is None else check_pose(read_matrix(options.e, "--E"), "--E")
         rig = Rig(K, K_right, E, source=str(options.k), measured=options.e is None)
-    cure = "Use the images that it is for, or scale K with them and give --fx --fy --cx --cy."
+    cure = "Use the images that it is for, or scale K with them and give --fx --fy --cx --cy --baseline."
     check_calibrated_size(left_size, rig.size_left, f"the left image {options.left}", rig.source, cure)
     if right_size is not None:
         name = f"the right image {options.right}"

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -91,12 +92,15 @@ def write_submission(results: Sequence[Path], to: str, out: Path, method: str = 
     folders = [path.parent for folder in results for path in sorted(folder.glob(f"**/{REPORT}"))]
     if not folders:
         refuse(f"No result of geodiff depth lies in {', '.join(map(str, results))}.")
-    scenes: set[Path] = set()
-    for folder in folders:
-        result = _submitted(folder)
-        if result.scene in scenes:
-            refuse(f"Two results are of the scene {result.scene}: give one of each.")
-        scenes.add(result.scene)
+    reports = [_report(folder) for folder in folders]
+    of_scene: dict[Path, Path] = {}
+    for folder, report in zip(folders, reports, strict=True):
+        other = of_scene.setdefault(_scene_of(report), folder)
+        if other is not folder:
+            cure = "A scene is the folder of its left image: give one result of each."
+            refuse(f"{other} and {folder} are both of the scene {_scene_of(report)}. {cure}")
+    for folder, report in zip(folders, reports, strict=True):
+        result = _submitted(folder, report)
         if to == "middlebury":
             _write_middlebury(result, out, method)
         else:
@@ -106,15 +110,22 @@ def write_submission(results: Sequence[Path], to: str, out: Path, method: str = 
     return len(folders)
 
 
-def _submitted(folder: Path) -> _Submitted:
+def _report(folder: Path) -> dict[str, Any]:
     report = read_report(folder)
     if "inputs" not in report:
         refuse(f"{folder / REPORT} is no report of geodiff depth.")
+    return report
+
+
+def _scene_of(report: dict[str, Any]) -> Path:
+    return Path(report["arguments"]["left"]).absolute().parent
+
+
+def _submitted(folder: Path, report: dict[str, Any]) -> _Submitted:
     K_left, K_right, E = (np.array(report["inputs"][n], np.float64) for n in ("K_left", "K_right", "E"))
     depth_m = read_npy(folder / "depth.npy", "RESULT", "a depth map")
-    scene = Path(report["arguments"]["left"]).absolute().parent
     disparity = disparity_of_depth(depth_m, K_left, K_right, E)
-    return _Submitted(scene, disparity, report["seconds"]["guided call"])
+    return _Submitted(_scene_of(report), disparity, report["seconds"]["guided call"])
 
 
 def _write_middlebury(result: _Submitted, out: Path, method: str) -> None:

@@ -143,7 +143,8 @@ def points_to_matches(
             "points",
             "in front of the left camera and inside its image, at least one of them",
             f"{left_out} of {len(z)} behind it or outside",
-            "They are metres in the left camera's frame: x right, y down, z forward. Is a pose missing?",
+            "They are metres in the left camera's frame: x right, y down, z forward. Bring points of another "
+            "frame into it first.",
         )
     height, width = size_grid
     scale = uv.new_tensor([width / size[1], height / size[0]])

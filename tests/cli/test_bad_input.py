@@ -39,6 +39,7 @@ EMPTY = ("empty.png", "l/a.png", "l/b.png", "r/b.png", "texts/a.md", "theirs/mod
 FILES: dict[str, Any] = dict.fromkeys(EMPTY, "") | {
     # cameras
     "K.txt": K,
+    "K-numbers.txt": "60 60 31.5 23.5\n",
     "K-nan.txt": np.where(K == 0, np.nan, K),
     "K-last-row.txt": K.T,
     "K-commas.txt": "60,5 0 31,5\n0 60,5 23,5\n0 0 1\n",

@@ -67,3 +67,7 @@ def test_submissions_are_what_the_benchmarks_read(geodiff, prior, pair_files) ->
         np.testing.assert_allclose(disparity, shift, rtol=1e-5)
         words = (sent / times).read_text().split()
         assert float(words[-1]) > 0 and words[:-1] == ["runtime"] * (benchmark == "eth3d")
+    shutil.copytree("result", "again")
+    answer = geodiff("submit", "result", "again", "--to", "eth3d", "--out", "twice")
+    assert answer.code == 2 and "result and again are both of the scene" in answer.err
+    assert not Path("twice").exists()

@@ -331,6 +331,17 @@ def test_what_shards_cannot_do_is_said(geodiff, fresh):
     assert "holds no table of a shard" in geodiff("merge", "left").err
 
 
+def test_without_ray_its_extra_is_named(geodiff, fresh, monkeypatch):
+    for name in ("geodiff_plugin.jobs.cluster", "geodiff_plugin.jobs.ray"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    for name in ("ray", "pyarrow"):
+        monkeypatch.setitem(sys.modules, name, None)
+    for way in ("folders", "parquet"):
+        answer = geodiff(*COMMAND, "--engine", "ray", "--as", way)
+        assert answer.code == 2 and "pip install 'geodiff-plugin[ray]'" in answer.err, answer.err
+    assert not (fresh / "out").exists()
+
+
 # Videos
 
 

@@ -71,6 +71,8 @@ def test_views_in_any_world_frame():
     guidance = GeometryGuidance.from_views(views, inner_steps=3)
     assert guidance.config.inner_steps == 3 and guidance.rigs[1].K_right[0, 2] == 36.5
     np.testing.assert_allclose([rig.E for rig in guidance.rigs], [E, UP], atol=1e-12)
+    with pytest.raises(ValueError, match="two at least; got 1. One view alone does not tell metres"):
+        GeometryGuidance.from_views(views[:1])
     with pytest.raises(ValueError, match="image must be of 64x48 pixels, as the left view; got 32x24"):
         guidance.prepare(torch.zeros(1, 3, 24, 32))
     with pytest.raises(ValueError, match="right must be a list of 2 images"):
