@@ -61,6 +61,7 @@ def main(argv: list[str] | None = None) -> None:
     depth_m = out.prediction[0, ..., 0]
     np.save(options.out, depth_m)
     print(f"{depth_m.min():.2f} to {depth_m.max():.2f} {out.unit or 'baselines'} -> {options.out}")
+    print(f"{out.verdict.status}, mean confidence {out.confidence.mean():.2f}")
     for sentence in out.warnings:
         print(f"warning: {sentence}")
 

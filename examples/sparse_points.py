@@ -57,7 +57,7 @@ def main(argv: list[str] | None = None) -> None:
     depth_m = out.prediction[0, ..., 0]
     np.save(options.out, depth_m)
     print(f"{depth_m.min():.2f} m to {depth_m.max():.2f} m, median {np.median(depth_m):.2f} m")
-    print(options.out)
+    print(f"{out.verdict.status}, mean confidence {out.confidence.mean():.2f} -> {options.out}")
     if truth_m is not None:
         withheld = pair.valid & (points == 0)
         error = np.abs(depth_m - truth_m)[withheld] / truth_m[withheld]

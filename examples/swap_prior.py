@@ -50,10 +50,9 @@ def main(argv: list[str] | None = None) -> None:
         seconds = time.perf_counter() - started
 
         depth_m = out.prediction[0, ..., 0]
-        apart = np.median(np.abs(depth_m / (maps[0] if maps else depth_m) - 1))
-        print(
-            f"  median {np.median(depth_m):.2f} m, {apart:.1%} from the first prior's depth, {seconds:.1f} s"
-        )
+        print(f"  median {np.median(depth_m):.2f} m, {seconds:.1f} s")
+        if maps:
+            print(f"  {np.median(np.abs(depth_m / maps[0] - 1)):.1%} from the first prior's depth")
         for sentence in out.warnings:
             print(f"  warning: {sentence}")
         maps.append(depth_m)

@@ -55,14 +55,14 @@ def run_demo(options: DepthOptions, out: OutFolder) -> None:
     aligned_m = align(single_map(plain.prediction), pair.depth_m, pair.valid, pipe.config.prediction_type)
     guided_m = single_map(result.run.output.prediction)
     table = new_table(("", "AbsRel", "delta1", "RMSE, m"))
-    rows = {"prior, aligned by an oracle": aligned_m, "guided, metric as it comes": guided_m}
+    rows = {"prior, aligned to the truth": aligned_m, "guided, metric as it comes": guided_m}
     for name, depth_m in rows.items():
         scores = evaluate_depth(depth_m, pair.depth_m, pair.valid)
         table.add_row(name, *(f"{scores[metric]:.3f}" for metric in ("abs_rel", "delta1", "rmse")))
     show(table)
     near, far = depth_range(pair.depth_m)
     maps = [colour_depth(depth_m, near=near, far=far) for depth_m in (aligned_m, guided_m, pair.depth_m)]
-    titles = ["left image", "prior, aligned by an oracle", "guided", f"truth, {near:.1f} m to {far:.1f} m"]
+    titles = ["left image", "prior, aligned to the truth", "guided", f"truth, {near:.1f} m to {far:.1f} m"]
     _write_comparison(out.path, [pair.left, *maps], titles)
     print(summary_line(result.report, f"{out.path}/"))
     print(f"Open {out.path / COMPARISON} first: prior, guided depth and truth side by side.")
