@@ -92,7 +92,10 @@ def edge_links(guide: Tensor, log_depth: Tensor) -> tuple[Tensor, Tensor]:
     return across, down
 
 
-@triton.jit(do_not_specialize=["n", "steps"], do_not_specialize_on_alignment=["residual", "noise", "weight"])
+@triton.jit(
+    do_not_specialize=["n", "steps"],
+    do_not_specialize_on_alignment=["matched", "confidence", "residual", "noise", "weight"],
+)
 def observe_kernel(
     log_depth, matched, confidence, plane_step, residual, noise, weight, n, steps, match_noise,
     BLOCK: tl.constexpr,
@@ -148,7 +151,10 @@ def _quantile(values, weight, share, n, every, CHUNK: tl.constexpr):
     return reached.to(tl.float32, bitcast=True)
 
 
-@triton.jit(do_not_specialize=["n", "every"], do_not_specialize_on_alignment=["residual", "noise", "weight"])
+@triton.jit(
+    do_not_specialize=["n", "every"],
+    do_not_specialize_on_alignment=["residual", "noise", "weight", "confidence"],
+)
 def spread_kernel(residual, noise, weight, confidence, spread, n, every, CHUNK: tl.constexpr):
     """``_spread`` of a sample."""
     sample = tl.program_id(0)

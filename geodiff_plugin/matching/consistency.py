@@ -224,6 +224,10 @@ def known_share(matches: Matches) -> Tensor:
     share of ``ENOUGH_KNOWN``; a pixel without a match has none, a known point that of the pixels that it
     stands for (see ``with_points``). 1 where no deviation is known.
     """
+    if use_kernel(matches.confidence) and matches.deviation is not None:
+        from geodiff_plugin.matching import window_kernels as kernels
+
+        return kernels.known_share(matches.deviation, matches.confidence)
     return _mean_precision(matches, 1.0).clamp_max(1.0)
 
 

@@ -86,7 +86,7 @@ def _distance_at(ordered, count, middle, place):
     return tl.maximum(tl.abs(tl.load(ordered + low) - middle), tl.abs(last - middle))
 
 
-@triton.jit(do_not_specialize=["n"])
+@triton.jit(do_not_specialize=["n"], do_not_specialize_on_alignment=["confidence", "counted"])
 def behind_kernel(inverse_depth, confidence, depth_m, behind, counted, n, BLOCK: tl.constexpr):
     """How far matches lie behind a map, in log depth; NaN for those that do not count for the spread."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -112,7 +112,9 @@ def spread_kernel(ordered, spread, n):
     tl.store(spread + sample, tl.maximum(found, _SPREAD_FLOOR))
 
 
-@triton.jit(do_not_specialize=["width", "radius", "n"])
+@triton.jit(
+    do_not_specialize=["width", "radius", "n"], do_not_specialize_on_alignment=["confidence", "weights"]
+)
 def rows_kernel(behind, confidence, sums, weights, width, radius, n, BLOCK: tl.constexpr):
     """Sums of distances and of weights over a part of the row around every pixel."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -127,7 +129,7 @@ def rows_kernel(behind, confidence, sums, weights, width, radius, n, BLOCK: tl.c
     tl.store(weights + p, known, inside)
 
 
-@triton.jit(do_not_specialize=["height", "width", "radius", "n"])
+@triton.jit(do_not_specialize=["height", "width", "radius", "n"], do_not_specialize_on_alignment=["weights"])
 def remaining_kernel(
     behind, sums, weights, spread, share, height, width, radius, n, BLOCK: tl.constexpr
 ):  # fmt: skip

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin._threads import BackgroundTask, sent_to_cpu
 from geodiff_plugin.geometry import image_size, is_rectified, resize_image, size_within
 from geodiff_plugin.matching.census import grey
@@ -208,6 +209,11 @@ def with_hidden(matches: Matches, strips: HiddenStrips) -> Matches:
     Nothing is matched there, and a fit would carry the nearer surface on until the image has an edge. They
     count as much as the matches around them know (``known_share``).
     """
+    if use_kernel(matches.confidence) and matches.deviation is not None:
+        from geodiff_plugin.matching import window_kernels as kernels
+
+        inverse_depth, confidence, deviation = kernels.with_hidden(matches, matches.deviation, strips)
+        return replace(matches, inverse_depth=inverse_depth, confidence=confidence, deviation=deviation)
     put = strips.inside & (matches.confidence < LEAST_KEPT)
     confidence = HIDDEN_CONFIDENCE * known_share(matches)
     return replace(

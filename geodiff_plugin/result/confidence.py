@@ -87,6 +87,17 @@ def grounds_of(denoised_m: Tensor, depth_m: Tensor, target: Matches, support: Te
         support: ``(1, 1, H, W)`` in [0, 1], of ``fit_depth``.
     """
     log_depth, denoised = (log_depth_at(each_m, target.size) for each_m in (depth_m, denoised_m))
+    grounds = _grounds_on_grid(log_depth, denoised, target)
+    found = F.interpolate(grounds, image_size(support), mode="bilinear")
+    return Grounds(support, *found.split(1, 1))
+
+
+def _grounds_on_grid(log_depth: Tensor, denoised: Tensor, target: Matches) -> Tensor:
+    """``apart``, ``moved`` and ``stepped`` of ``Grounds``, ``(1, 3, h, w)``, on the grid of the matches."""
+    if use_kernel(log_depth):
+        from geodiff_plugin.result import grounds_kernels as kernels
+
+        return kernels.grounds_on_grid(log_depth, denoised, target)
     planes = (target.inverse_depth - torch.exp(-log_depth)) / target.plane_step.view(-1, 1, 1, 1)
     weighted = target.confidence * planes.abs().clamp_max(FAR)
     layers = torch.cat([target.confidence, weighted, (log_depth - denoised).abs()], 1)
@@ -96,9 +107,7 @@ def grounds_of(denoised_m: Tensor, depth_m: Tensor, target: Matches, support: Te
     known = target.confidence.clamp_max(1.0).mean((2, 3), keepdim=True)
     share = known / (known + FEW)
     moved = moved.clamp(STEADY, MOVED) ** share * MOVED ** (1.0 - share)
-    stepped = range_around(log_depth, EVEN_REACH)
-    found = F.interpolate(torch.cat([apart, moved, stepped], 1), image_size(support), mode="bilinear")
-    return Grounds(support, *found.split(1, 1))
+    return torch.cat([apart, moved, range_around(log_depth, EVEN_REACH)], 1)
 
 
 def depth_evidence(grounds: Grounds, spread: Tensor | None, prior_error: Tensor | None = None) -> Tensor:

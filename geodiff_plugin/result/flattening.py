@@ -53,6 +53,15 @@ LEAST_SHARE = 0.3
 LEAST_INVERSE = 1e-3
 
 
+class _Known(NamedTuple):
+    """What the matches know of a map, ``(1, 1, h, w)`` each, on their grid."""
+
+    inverse: Tensor  # inverse depth, about 1
+    shape: Tensor  # ``known_shape``
+    held: Tensor  # how firmly values are held by it
+    weight: Tensor  # of changes of the inverse depth
+
+
 class _Surface(NamedTuple):
     """A map on one grid, ``(1, 1, h, w)``."""
 
@@ -101,14 +110,24 @@ def flatten(depth_m: Tensor, target: Matches, left_01: Tensor, error: Tensor, de
     log_depth = depth_m.float().log()
     unit, good = log_depth.mean(), (WEAK_PRIOR / error).clamp_min(1.0) ** 4
     on_grid = _on(log_depth, target.size)
-    surface = _Surface(torch.exp(unit - on_grid), _links_of_walls(on_grid, denoised_m, left_01, good))
-    known = known_shape(target, torch.exp(-on_grid))
-    wanted = _Wanted(_smoothed(surface, known), _held(known))
-    weight = _relative(wanted.held + LEAST_VALUE_WEIGHT * good, surface)
-    change = _towards(wanted.slopes, surface, weight)
+    known = _known_of(target, on_grid, unit, good)
+    surface = _Surface(known.inverse, _links_of_walls(on_grid, denoised_m, left_01, good))
+    wanted = _Wanted(_smoothed(surface, known.shape), known.held)
+    change = _towards(wanted.slopes, surface, known.weight)
     lowering = _on(_lowering(surface, change), image_size(depth_m))
     lowering = lowering + _lowering_of_detail(log_depth - lowering, unit, wanted, left_01, good)
     return (depth_m * torch.exp(-lowering)).to(depth_m.dtype)
+
+
+def _known_of(target: Matches, log_depth: Tensor, unit: Tensor, good: Tensor) -> _Known:
+    """What matches know of a map on their grid, about ``unit ()``; ``good`` is as in ``_links_of_walls``."""
+    if use_kernel(log_depth) and target.deviation is not None:
+        from geodiff_plugin.result import flattening_kernels as kernels
+
+        return _Known(*kernels.known_of(target, target.deviation, log_depth, unit, good))
+    inverse, shape = torch.exp(unit - log_depth), known_shape(target, torch.exp(-log_depth))
+    held = _held(shape)
+    return _Known(inverse, shape, held, _relative(held + LEAST_VALUE_WEIGHT * good, inverse))
 
 
 def _links_of_walls(
@@ -131,7 +150,7 @@ def _lowering_of_detail(
     surface = _Surface(torch.exp(unit - on_grid), _links(on_grid, _guide(left_01, size), DETAIL_EDGE))
     # A slope is the change from one pixel to the next, and the pixels of this grid are smaller.
     smaller = constant_like(wanted.slopes, width / size[1], height / size[0]).view(2, 1, 1, 1)
-    weight = _relative(_on(wanted.held, size) + LEAST_DETAIL_WEIGHT * good, surface)
+    weight = _relative(_on(wanted.held, size) + LEAST_DETAIL_WEIGHT * good, surface.inverse)
     change = _towards(smaller * _on(wanted.slopes, size), surface, weight, torch.zeros_like(weight))
     return _on(_lowering(surface, change), image_size(log_depth))
 
@@ -158,9 +177,9 @@ def _held(known: Tensor) -> Tensor:
     return (known**2 / (1.0 - known).clamp_min(1e-6)).clamp_max(MOST_VALUE_WEIGHT)
 
 
-def _relative(weight: Tensor, surface: _Surface) -> Tensor:
+def _relative(weight: Tensor, inverse: Tensor) -> Tensor:
     """The weight of changes of the inverse depth by that of their shares of it."""
-    return weight / surface.inverse.clamp_min(LEAST_INVERSE) ** 2
+    return weight / inverse.clamp_min(LEAST_INVERSE) ** 2
 
 
 def _lowering(surface: _Surface, change: Tensor) -> Tensor:

@@ -11,6 +11,8 @@ import triton.language as tl
 from torch import Tensor
 
 from geodiff_plugin._kernels import launched_on
+from geodiff_plugin.matching import Matches, consistency
+from geodiff_plugin.matching.window_kernels import TILE, mean_precision, tile_places, tiles
 from geodiff_plugin.result import flattening
 
 #: Pixels of a program.
@@ -18,6 +20,46 @@ BLOCK = 512
 # A kernel reads constants of its module only as these.
 _LEAST_SLOPE_WEIGHT = tl.constexpr(flattening.LEAST_SLOPE_WEIGHT)
 _SLOPES = tl.constexpr(flattening.SLOPES)
+_LEAST_VALUE_WEIGHT = tl.constexpr(flattening.LEAST_VALUE_WEIGHT)
+_MOST_VALUE_WEIGHT = tl.constexpr(flattening.MOST_VALUE_WEIGHT)
+_LEAST_INVERSE = tl.constexpr(flattening.LEAST_INVERSE)
+_LEAST_DEVIATION = tl.constexpr(consistency.LEAST_DEVIATION)
+_FAR_PLANES = tl.constexpr(consistency.FAR_PLANES)
+
+
+@triton.jit(
+    do_not_specialize=["height", "width"],
+    do_not_specialize_on_alignment=["deviation", "confidence", "shape", "held", "weight"],
+)
+def known_kernel(
+    deviation, confidence, log_depth, step, unit, good, inverse, shape, held, weight, height, width,
+    ROWS: tl.constexpr, COLUMNS: tl.constexpr,
+):  # fmt: skip
+    """``flattening._known_of``. Grid: tiles down, tiles across."""
+    p, inside = tile_places(height, width, ROWS, COLUMNS)
+    known = mean_precision(deviation, confidence, _LEAST_DEVIATION, height, width, ROWS, COLUMNS)
+    away = tl.load(log_depth + p, inside, 0.0)
+    planes = tl.exp(-away) / tl.load(step)
+    known = tl.minimum(known * tl.minimum(planes / _FAR_PLANES, 1.0), 1.0)
+    firmly = tl.minimum(known * known / tl.maximum(1.0 - known, 1e-6), _MOST_VALUE_WEIGHT)
+    about_one = tl.exp(tl.load(unit) - away)
+    least = tl.maximum(about_one, _LEAST_INVERSE)
+    tl.store(inverse + p, about_one, inside)
+    tl.store(shape + p, known, inside)
+    tl.store(held + p, firmly, inside)
+    tl.store(weight + p, (firmly + tl.load(good) * _LEAST_VALUE_WEIGHT) / (least * least), inside)
+
+
+def known_of(
+    target: Matches, deviation: Tensor, log_depth: Tensor, unit: Tensor, good: Tensor
+) -> tuple[Tensor, ...]:
+    """The maps of ``flattening._known_of``, for matches whose deviation is known."""
+    maps = log_depth.new_empty(4, *log_depth.shape).unbind()
+    launched_on(log_depth, known_kernel[tiles(target.size)])(
+        deviation.contiguous(), target.confidence.contiguous(), log_depth.contiguous(), target.plane_step,
+        unit, good, *maps, *target.size, ROWS=TILE[0], COLUMNS=TILE[1],
+    )  # fmt: skip
+    return maps
 
 
 @triton.jit

@@ -25,7 +25,7 @@ _LOW, _HIGH = map(tl.constexpr, indicators.ENDS)
 _FINITE = tl.constexpr(3.4028234663852886e38)
 
 
-@triton.jit(do_not_specialize=["n"])
+@triton.jit(do_not_specialize=["n"], do_not_specialize_on_alignment=["off"])
 def marked_kernel(inverse_depth, confidence, step, depth_m, matched, off, n, BLOCK: tl.constexpr):
     """What of matches is sorted, and NaN elsewhere: inverse depth, and how far the result is from it.
 
@@ -42,7 +42,7 @@ def marked_kernel(inverse_depth, confidence, step, depth_m, matched, off, n, BLO
     tl.store(off + p, tl.where(compared, tl.abs(tl.log(ratio)), float("nan")), inside)
 
 
-@triton.jit(do_not_specialize=["n"])
+@triton.jit(do_not_specialize=["n"], do_not_specialize_on_alignment=["off"])
 def numbers_kernel(matched, off, step, numbers, n):
     """``NUMBERS``, of what ``marked_kernel`` marks, sorted."""
     confident, in_front = count_below(matched, n, float("inf")), count_below(matched, n, _FINITE)

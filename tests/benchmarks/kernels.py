@@ -27,10 +27,12 @@ from geodiff_plugin.algorithm import kernels as algorithm
 from geodiff_plugin.cli.terminal import new_table, show
 from geodiff_plugin.matching import kernels as matching
 from geodiff_plugin.matching import reflection_kernels as reflection
+from geodiff_plugin.matching import window_kernels as window
 from geodiff_plugin.matching.census import MARGIN_PX, SIDE, VOTE_LEVELS
 from geodiff_plugin.matching.consistency import EVERY_ROW
 from geodiff_plugin.result import exposure_kernels as exposure
 from geodiff_plugin.result import flattening_kernels as flattening
+from geodiff_plugin.result import grounds_kernels as grounds
 from geodiff_plugin.result import indicator_kernels as indicator
 from geodiff_plugin.result import kernels as result
 from geodiff_plugin.runtime import kernels as runtime
@@ -110,6 +112,11 @@ def _of_the_matches() -> Iterator[Compiled]:
     yield Compiled("sums of rows", reflection.rows_kernel, rows, block, 4)
     remaining = 5 * "*fp32 " + 4 * "i32 "
     yield Compiled("what remains of matches", reflection.remaining_kernel, remaining, block, 4)
+    tile = dict(zip(("ROWS", "COLUMNS"), window.TILE, strict=True))
+    yield Compiled("what matches know", window.known_kernel, 3 * "*fp32 " + "i32 i32", tile, 4)
+    hidden = 3 * "*fp32 " + "*i1 " + 4 * "*fp32 " + "i32 i32"
+    yield Compiled("hidden strips", window.hidden_kernel, hidden, tile, 4)
+    yield Compiled("grounds", grounds.grounds_kernel, 7 * "*fp32 " + "i32 i32", tile, 4)
     marked = 6 * "*fp32 " + "i32"
     yield Compiled("matches to sort", indicator.marked_kernel, marked, {"BLOCK": indicator.BLOCK}, 4)
     yield Compiled("numbers of matches", indicator.numbers_kernel, 4 * "*fp32 " + "i32", {}, 1)
@@ -204,6 +211,8 @@ def _of_the_fit() -> Iterator[Compiled]:
 
 def _of_the_flattening() -> Iterator[Compiled]:
     block = {"BLOCK": flattening.BLOCK}
+    tile = dict(zip(("ROWS", "COLUMNS"), window.TILE, strict=True))
+    yield Compiled("known shape", flattening.known_kernel, 10 * "*fp32 " + "i32 i32", tile, 4)
     yield Compiled("slopes", flattening.slopes_kernel, 6 * "*fp32 " + "i32 i32", block, 4)
     yield Compiled("pull of the slopes", flattening.forces_kernel, 5 * "*fp32 " + "i32 i32", block, 4)
 

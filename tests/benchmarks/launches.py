@@ -67,6 +67,10 @@ WITH_KERNELS = (
     "depth_confidence",
     "reject_reflections",
     "_of_matches_and_depth",
+    "known_share",
+    "with_hidden",
+    "_grounds_on_grid",
+    "_known_of",
 )
 #: Functions, and methods as ``Class.method``, whose operations are shown apart; each without those below it.
 STAGES = (

@@ -1,6 +1,7 @@
-"""Kernels that judge matches, against their references: reflections, and what indicators say of matches."""
+"""Kernels that judge matches, against their references: reflections, windows around them, their numbers."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,11 +9,26 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin.matching import Matches, matches, reject_reflections
+from geodiff_plugin.matching import Matches, known_share, matches, reject_reflections
+from geodiff_plugin.matching.rows import HiddenStrips, with_hidden
+from geodiff_plugin.result.confidence import _grounds_on_grid
+from geodiff_plugin.result.flattening import _known_of
 from geodiff_plugin.result.indicators import _of_matches_and_depth
 from tests.kernels.drawn import drawn
 
 SIZES = st.tuples(st.integers(1, 40), st.integers(1, 40))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_tiles(device):
+    """Tiles of so few pixels that a small grid has several."""
+    from geodiff_plugin.matching import window_kernels
+    from geodiff_plugin.result import flattening_kernels, grounds_kernels
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (window_kernels, flattening_kernels, grounds_kernels):
+            patch.setattr(module, "TILE", (16, 64))
+        yield
 
 
 def random_matches(seed: int, batch: int, size: tuple[int, int], device: torch.device) -> Matches:
@@ -84,3 +100,59 @@ def test_more_values_than_are_sorted_are_left_to_the_reference(device, monkeypat
             both.append((reject_reflections(found, depth_m), *(float(each) for each in numbers.values())))
     assert torch.equal(both[0][0], both[1][0])
     assert all(math.isclose(one, other) for one, other in zip(both[0][1:], both[1][1:], strict=True))
+
+
+def with_deviation(found: Matches, seed: int) -> Matches:
+    """Matches that deviate by half a plane to four; some are known points."""
+    size, generator = found.confidence.shape, torch.Generator().manual_seed(seed)
+    deviation = 0.3 + 4.0 * torch.rand(size, generator=generator).to(found.confidence)
+    points = 20.0 * (torch.rand(size, generator=generator) > 0.95).to(found.confidence)
+    return replace(found, deviation=deviation, confidence=torch.maximum(found.confidence, points))
+
+
+def assert_same(call) -> None:
+    """Every map of kernel and reference within 1e-5 of the largest value."""
+    found = call()
+    with without_kernels():
+        expected = call()
+    for ours, theirs in zip(found, expected, strict=True):
+        assert ours.shape == theirs.shape and ours.dtype == theirs.dtype
+        assert (ours - theirs).abs().max() <= 1e-5 * theirs.abs().max()
+
+
+@drawn(2)
+@given(seed=st.integers(0, 999), size=SIZES)
+@example(seed=0, size=(31, 37))
+def test_what_matches_know_around_them(device, seed, size):
+    found = with_deviation(random_matches(seed, 2, size, device), seed)
+    assert_same(lambda: [known_share(found)])
+
+
+@drawn(2)
+@given(seed=st.integers(0, 999), size=SIZES)
+@example(seed=0, size=(31, 37))
+def test_strips_that_the_right_view_cannot_see(device, seed, size):
+    found = with_deviation(random_matches(seed, 1, size, device), seed)
+    generator = torch.Generator().manual_seed(seed + 1)
+    rows = [torch.rand(1, 1, *size, generator=generator).to(device) for _ in range(2)]
+    strips = HiddenStrips(rows[0] > 0.4, rows[1])
+
+    def filled() -> list[torch.Tensor]:
+        kept = with_hidden(found, strips)
+        assert kept.deviation is not None
+        return [kept.inverse_depth, kept.confidence, kept.deviation]
+
+    assert_same(filled)
+
+
+@drawn(2)
+@given(seed=st.integers(0, 999), size=SIZES)
+@example(seed=0, size=(31, 37))
+def test_grounds_of_a_depth_and_what_is_known_of_its_shape(device, seed, size):
+    found = with_deviation(random_matches(seed, 1, size, device), seed)
+    generator = torch.Generator().manual_seed(seed)
+    log_depth = (2.8 + 0.4 * torch.rand(1, 1, *size, generator=generator)).log().to(device)
+    denoised = log_depth + 0.1 * torch.rand(1, 1, *size, generator=generator).to(device)
+    good = torch.full((1, 1, 1, 1), 1.5, device=device)
+    assert_same(lambda: _grounds_on_grid(log_depth, denoised, found).unbind(1))
+    assert_same(lambda: _known_of(found, log_depth, log_depth.mean(), good))
