@@ -382,7 +382,7 @@ def _from_nothing(base: Reconstruction, notes: list[Message]) -> SolvedCapture:
     E, K = base.poses(models[0]), base.K(models[0])
     there = np.isfinite(E).all((1, 2))
     after = median_px(residuals_px(E, K, [m for m in base.matches if there[[m.i, m.j]].all()]))
-    if len(models) > 1:
-        sentence = f"{len(models)} parts are not connected; the largest is used."
+    if len(models) > 1 and not there.all():  # another model may hold frames of the largest alone
+        sentence = f"The frames form {len(models)} parts that are not connected; the largest is used."
         notes.append(Message("capture.parts", sentence))
     return _result(base, models[0], "estimated", None, (math.nan, after))
