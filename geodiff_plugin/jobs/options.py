@@ -360,7 +360,8 @@ class DepthOptions(SpeedOptions, RunOptions):
         if missing:
             names = dict.fromkeys((*needed[way], *WAYS[way]))
             there = " ".join(_flag(name) for name in names if name in given)
-            refuse(f"With {there} give {' '.join(missing)} as well.")
+            instead = " For photographs alone add --estimate-pose." if given == {"baseline"} else ""
+            refuse(f"With {there} give {' '.join(missing)} as well.{instead}")
         if self.cropped and way == "parameters" and None in (self.cx, self.cy):
             refuse("With --cropped give --cx --cy as well: the middle of a crop is not that of the camera.")
         if self.estimate_pose and self.cropped and way in ("--fov", "EXIF") and not self.view_k:

@@ -274,14 +274,17 @@ class Scale:
         return None if self.source == "none" else "m"
 
 
-def _point_at(px: np.ndarray, tracks: Tracks, inverse_depth: np.ndarray) -> tuple[np.ndarray, float]:
-    """The point ``(3,)`` of a left pixel in units, and the relative spread of its depth."""
+def _point_at(
+    pixel: np.ndarray, factor: float, tracks: Tracks, inverse_depth: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """The point ``(3,)`` of a pixel of the left photograph in units, and the relative spread of its depth."""
+    px = (pixel + 0.5) * factor - 0.5
     away = np.linalg.norm(tracks.left_px - px, axis=1)
     near = np.argsort(away)[:8]
     near = near[away[near] < _NEAR_PX]
     if len(near) < 3:
         cure = "Choose ends on something with texture that both photographs show."
-        got = f"({px[0]:.0f}, {px[1]:.0f}) with {len(near)} nearby"
+        got = f"({pixel[0]:.0f}, {pixel[1]:.0f}) with {len(near)} nearby"
         bad_value("known length", "near matched points", got, cure)
     w = inverse_depth[near]
     middle = float(np.median(w))
@@ -319,8 +322,8 @@ def find_scale(
     if known_length is not None:
         *ends, metres = known_length
         check_number(metres, "known length", 1e-6, 1e6)
-        pixels = (np.array(ends).reshape(2, 2) + 0.5) * factor - 0.5
-        (first, s1), (second, s2) = (_point_at(px, tracks, inverse_depth) for px in pixels)
+        pixels = np.array(ends).reshape(2, 2)
+        (first, s1), (second, s2) = (_point_at(each, factor, tracks, inverse_depth) for each in pixels)
         length = float(np.linalg.norm(first - second))
         if length < 1e-9:
             bad_value("known length", "between two places", "the same place twice")

@@ -100,6 +100,8 @@ def test_each_known_length_gives_the_scale() -> None:
     assert length.factor == pytest.approx(true, rel=0.01) and length.unit == "m"
     nothing = find_scale(tracks, units, 1.0, None, None, None)
     assert nothing.unit is None and "no unit" in nothing.warnings[0]
+    with pytest.raises(ValueError, match=r"got \(9000, 150\) with 0 nearby"):  # as it was typed
+        find_scale(tracks, units, 0.5, None, (9000, 150, 350, 190, 1.6), None)
     with pytest.raises(ValueError, match="given once"):
         find_scale(tracks, units, 1.0, 0.25, (0, 0, 1, 1, 1), None)
 
