@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import importlib
-import pickle
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -52,13 +51,3 @@ def uncollected() -> Iterator[None]:
         _left_out = True
     finally:
         gc.enable()
-
-
-def call_uncollected(pickled: bytes) -> None:
-    """Call a pickled function with its pickled arguments, ``uncollected`` around the imports of both.
-
-    For a new process of ``multiprocessing``, which would unpickle them before anything of ours runs.
-    """
-    with uncollected():
-        function, arguments = pickle.loads(pickled)
-    function(*arguments)

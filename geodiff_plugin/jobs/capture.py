@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
-import pickle
-import sys
 import time
 from collections.abc import Callable, Sequence
+from contextvars import Context
 from dataclasses import dataclass, fields, replace
 from functools import cache, partial
 from importlib.util import find_spec
@@ -21,7 +19,6 @@ import torch
 
 from geodiff_plugin import __version__
 from geodiff_plugin._checks import InputError, bad_value, refuse, warn
-from geodiff_plugin._lazy import call_uncollected
 from geodiff_plugin._threads import WithinCores, available_cores
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.capture.results import ALONE, save_alone, write_agreement, write_results
@@ -38,7 +35,7 @@ from geodiff_plugin.jobs.prior import compile_for, graphs_for_many, load_quiet_p
 from geodiff_plugin.jobs.provenance import RECORD, SUMMARY, Provenance, begin_frames, check_poses
 from geodiff_plugin.jobs.report import messages_of, plain, read_report, single_map, verdict_report
 from geodiff_plugin.jobs.runner import Runner
-from geodiff_plugin.jobs.stopping import ending_with_parent
+from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcess, close_all
 from geodiff_plugin.jobs.telling import Tell, collected_warnings, say, silent
 from geodiff_plugin.jobs.writing import write_maps
 from geodiff_plugin.messages import Message, as_records
@@ -60,7 +57,7 @@ FEWER_PROCESSES = ", or give a lower --processes"
 
 @dataclass(frozen=True)
 class RunKeys:
-    """What a helping process needs beside the options: keys of poses and frames, and the scale."""
+    """What another process needs beside the options: keys of poses and frames, and the scale."""
 
     poses_key: str
     frames_key: str
@@ -214,16 +211,23 @@ def _run_frames(
         for each in (path, *shards_beside(path).values()) if shard.whole else (shard.path(path),):
             each.unlink(missing_ok=True)
     items = [Item(name, inputs=keys.frames_key, head={"frame": name}) for name in names]
-    if not shard.whole:
-        return _work(capture, options, items, shard, progress)
-    if options.engine == "ray":
+    if options.engine == "ray" and shard.whole:
         return _frames_on_ray(options, items, keys, progress)
-    with Journal(path) as journal:
-        count = _processes(options, sum(journal.get(item) is None for item in items))
-        if count > 1 and _in_processes(capture, options, items, keys, count, progress):
-            made = journal.read()
-            return [made[item.key, item.inputs] for item in items]
-    return _work(capture, options, items, shard, progress)  # all, or what a lost process has left
+    with Journal(path, shard) as journal:
+        runner = Runner(
+            shard.part(items),
+            journal,
+            noun="frame",
+            survives=(InputError, OSError, ValueError, RuntimeError),
+            progress=progress,
+            whole=lambda item, _: _is_made(item, options.out / item.key),
+        )
+        make = partial(_make_frame, capture, options, cache(partial(_pipe, options)))
+        count = _processes(options, len(runner.left)) if shard.whole else 1
+        if count > 1:
+            return _in_processes(runner, make, options, keys, count)
+        with WithinCores(1 if options.shard else shard.count):
+            return runner.run(make)
 
 
 def _frames_on_ray(
@@ -241,36 +245,54 @@ def _frames_on_ray(
 
 def _frame_by_name(options: CaptureOptions, keys: RunKeys) -> Callable[[str], Record]:
     """What an actor does with the name of a frame."""
-    with collected_warnings(silent):  # the driver has told them
-        capture = open_capture(options)
-        solved_poses(capture, options, keys.poses_key, keys.scale)
+    capture = _opened_again(options, keys)
     loaded = cache(partial(_pipe, options))
     return lambda name: _make_frame(capture, options, loaded, Item(name, inputs=keys.frames_key))
 
 
+def _opened_again(options: CaptureOptions, keys: RunKeys) -> Capture:
+    """The capture with its solved poses, in another process; what the first has told is not told again."""
+
+    def opened() -> Capture:
+        with collected_warnings(silent):
+            capture = open_capture(options)
+            solved_poses(capture, options, keys.poses_key, keys.scale)
+            return capture
+
+    return Context().run(opened)  # where no ``noted`` block hears it
+
+
 def _in_processes(
-    capture: Capture,
-    options: CaptureOptions,
-    items: Sequence[Item],
-    keys: RunKeys,
-    count: int,
-    progress: bool,
-) -> bool:
-    """The frames by so many processes, a shard each, of which this is one; whether none was lost."""
-    context, more = multiprocessing.get_context("spawn"), list[Any]()
-    for index in range(1, count):
-        helping = pickle.dumps((_help, (options, items, keys, Shard(index, count))))
-        more.append(context.Process(target=call_uncollected, args=(helping,), daemon=True))
-        more[-1].start()
+    runner: Runner, make: Callable[[Item], Record], options: CaptureOptions, keys: RunKeys, count: int
+) -> list[Record]:
+    """The frames by so many processes, of which this is one; each has the cores that the others leave it."""
+    helping = partial(_help, replace(options, overwrite=False), keys, count)
+    helpers = [SeparateProcess(__name__, extended=True) for _ in range(count - 1)]
+
+    def make_here(item: Item) -> Record:
+        with WithinCores(1 + sum(helper.alive for helper in helpers)):
+            return make(item)
+
     try:
-        _work(capture, options, items, Shard(0, count), progress)
-        for process in more:
-            process.join()
+        return runner.run_beside(helpers, helping, make_here)
     finally:
-        for process in more:
-            process.terminate()
-            process.join()
-    return all(process.exitcode == 0 for process in more)
+        close_all(helpers)
+
+
+def _help(options: CaptureOptions, keys: RunKeys, count: int, item: Item) -> Record:
+    """A frame by one of so many processes that does nothing else."""
+    with WithinCores(count):
+        try:
+            capture, pipe = _ready(options, keys)
+        except Exception as error:  # for example of a prior that only the first process knows
+            raise ProcessEnded(f"A process beside this one cannot begin: {error}") from error
+        return _make_frame(capture, options, lambda: pipe, item)
+
+
+@cache
+def _ready(options: CaptureOptions, keys: RunKeys) -> tuple[Capture, Any]:
+    """The capture and the prior of a process that helps."""
+    return _opened_again(options, keys), _pipe(options)
 
 
 def _processes(options: CaptureOptions, left: int) -> int:
@@ -281,41 +303,10 @@ def _processes(options: CaptureOptions, left: int) -> int:
     return max(1, min(wanted, left))
 
 
-def _work(
-    capture: Capture, options: CaptureOptions, items: Sequence[Item], shard: Shard, progress: bool = False
-) -> list[Record]:
-    """The frames of one of several processes; each has the cores that the others leave it."""
-    cores = WithinCores(1 if options.shard else shard.count)
-    with cores, Journal(options.out / JOURNAL, shard) as journal:
-        runner = Runner(
-            shard.part(items),
-            journal,
-            noun="frame",
-            survives=(InputError, OSError, ValueError, RuntimeError),
-            progress=progress,
-            whole=lambda item, _: _is_made(item, options.out / item.key),
-        )
-        return runner.run(partial(_make_frame, capture, options, cache(partial(_pipe, options))))
-
-
 def _is_made(item: Item, folder: Path) -> bool:
     """Whether a folder holds what this item would make."""
     whole = all((folder / f"{file}.npy").is_file() for file in ALONE)
     return whole and read_report(folder).get("made_from") == item.inputs
-
-
-def _help(options: CaptureOptions, items: list[Item], keys: RunKeys, shard: Shard) -> None:
-    """Another process of the same run, with a part of its own."""
-    options = replace(options, overwrite=False)
-    try:
-        with ending_with_parent():
-            with collected_warnings(silent):  # the first process has told them
-                capture = open_capture(options)
-                solved_poses(capture, options, keys.poses_key, keys.scale)
-            with collected_warnings(say):
-                _work(capture, options, items, shard)
-    except KeyboardInterrupt:  # said by the first process
-        sys.exit(1)
 
 
 def depth_capture(options: CaptureOptions, *, tell: Tell = silent, progress: bool = False) -> Record:

@@ -14,6 +14,8 @@ from geodiff_plugin.jobs.journal import Item
 MOST_NAMES = 5
 #: With one of these causes the next item cannot be written either.
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+#: What is said of a run that ended early.
+RESUMES = "Finished pairs stay; the same command goes on with the rest."
 
 
 class DiskFull(InputError):
@@ -29,8 +31,7 @@ def full_disk(error: BaseException) -> DiskFull | None:
         cause = cause.__cause__ or cause.__context__
     if not isinstance(cause, OSError):
         return None
-    resumes = "Finished pairs stay; the same command goes on with the rest."
-    return DiskFull(f"The disk of --out is full ({reason_of(cause)}). {resumes}")
+    return DiskFull(f"The disk of --out is full ({reason_of(cause)}). {RESUMES}")
 
 
 class Failures:

@@ -18,7 +18,7 @@ from geodiff_plugin.evidence.inputs import left_images
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.formats.reading import has_pose_per_image
-from geodiff_plugin.jobs.failures import full_disk
+from geodiff_plugin.jobs.failures import RESUMES, full_disk
 from geodiff_plugin.jobs.finished import Row, file_digests, finished_row
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard
 from geodiff_plugin.jobs.options import DepthOptions, start_pair
@@ -55,7 +55,7 @@ def _ends_run_if_all_would_fail() -> Iterator[None]:
     try:
         yield
     except ProcessEnded as error:
-        raise _EndsRun from error
+        raise _EndsRun from ProcessEnded(f"{error} {RESUMES}")
     except Exception as error:
         if (full := full_disk(error)) is not None:
             raise _EndsRun from full

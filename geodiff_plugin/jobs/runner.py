@@ -10,9 +10,10 @@ import sys
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from threading import Semaphore
+from threading import Lock, Semaphore
 from typing import Any
 
 from tqdm import tqdm
@@ -20,6 +21,7 @@ from tqdm import tqdm
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.jobs.failures import Failures
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Record
+from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcess
 from geodiff_plugin.jobs.telling import say
 
 Stage = Callable[[Any], Any]
@@ -63,7 +65,12 @@ class Runner:
             if record is not None and whole is not None and not whole(item, record):
                 journal.forget(item)
         self._noun, self._survives, self._progress = noun, survives, progress
-        self._failures = Failures(len(self.items), noun, say)
+        self._failures, self._recording = Failures(len(self.items), noun, say), Lock()
+
+    @property
+    def left(self) -> list[Item]:
+        """Items without a record."""
+        return [item for item in self.items if self.journal.get(item) is None]
 
     def run(
         self, *stages: Stage, release: Callable[[Item], None] | None = None, most: int | None = None
@@ -79,37 +86,110 @@ class Runner:
         Raises:
             InputError: all items failed for one reason.
         """
-        left = [item for item in self.items if self.journal.get(item) is None]
-        line = _Line(stages)
+        left, line = self.left, _Line(stages)
         most = most or line.threads
         begun: deque[tuple[Item, Callable[[], Record]]] = deque()
-        about = {"unit": f" {self._noun}", "file": sys.stderr, "disable": not self._progress}
         release = release or (lambda _: None)
         try:
-            with tqdm(total=len(self.items), initial=len(self.items) - len(left), **about) as bar:
+            with self._bar() as bar:
                 while left or begun:
                     if left and len(begun) < most:
                         item = left.pop(0)
                         begun.append((item, line.begin(item)))
                         continue
-                    self._record(*begun[0])
+                    self._record(*begun[0], bar)
                     release(begun.popleft()[0])
-                    bar.update()
         finally:
             line.close()
             for item, _ in begun:
                 release(item)
+        return self._records()
+
+    def run_beside(
+        self, processes: Sequence[SeparateProcess], function: Callable[[Item], Record], stage: Stage
+    ) -> list[Record]:
+        """As ``run(stage)``, while each of ``processes`` calls ``function`` likewise with an item at a time.
+
+        Whoever is free takes the next item. One whose process ends, or raises ``ProcessEnded``, is made here.
+        An error or Ctrl-C, which ends the run, ends the processes as well.
+        """
+        left = _Left(self.left)
+        with self._bar() as bar, ThreadPoolExecutor(len(processes)) as pool:
+            try:
+                calls = [partial(process.call, function) for process in processes]
+                beside = [pool.submit(self._take, left, call, bar) for call in calls]
+                self._take(left, stage, bar)
+                for each in beside:
+                    each.result()
+                self._take(left, stage, bar)  # what a process has left at last
+            except BaseException:
+                left.stop()
+                for process in processes:
+                    process.end()
+                raise
+        return self._records()
+
+    def _take(self, left: _Left, stage: Stage, bar: tqdm) -> None:
+        """Put one item after the other through a stage."""
+        try:
+            while (item := left.take()) is not None:
+                self._record(item, partial(stage, item), bar)
+        except ProcessEnded as error:
+            assert item is not None
+            if left.put_back(item):
+                say(f"geodiff: {item.label} is made anew: {error}")
+        except BaseException:
+            left.stop()
+            raise
+
+    def _bar(self) -> tqdm:
+        total, left = len(self.items), len(self.left)
+        about = {"unit": f" {self._noun}", "file": sys.stderr, "disable": not self._progress}
+        return tqdm(total=total, initial=total - left, **about)
+
+    def _record(self, item: Item, result: Callable[[], Record], bar: tqdm) -> None:
+        error: Exception | None = None
+        try:
+            record = result()
+        except ProcessEnded:  # it says nothing of the item
+            raise
+        except self._survives as raised:
+            error = raised
+        with self._recording:
+            if error is None:
+                self._failures.passed()
+            else:
+                record = {"status": BROKEN, "error": self._failures.add(item, error)}
+            self.journal.put(item, record)
+            bar.update()
+
+    def _records(self) -> list[Record]:
         self._failures.report()
         return [record for item in self.items if (record := self.journal.get(item)) is not None]
 
-    def _record(self, item: Item, result: Callable[[], Record]) -> None:
-        try:
-            record = result()
-        except self._survives as error:
-            record = {"status": BROKEN, "error": self._failures.add(item, error)}
-        else:
-            self._failures.passed()
-        self.journal.put(item, record)
+
+class _Left:
+    """Items that several threads take, until there are none or these are to stop."""
+
+    def __init__(self, items: Sequence[Item]) -> None:
+        self._items, self._stopped = deque(items), False
+
+    def take(self) -> Item | None:
+        """The next one."""
+        with suppress(IndexError):
+            return self._items.popleft()
+        return None
+
+    def put_back(self, item: Item) -> bool:
+        """Let another thread take it; whether one may."""
+        if not self._stopped:
+            self._items.appendleft(item)
+        return not self._stopped
+
+    def stop(self) -> None:
+        """Let there be none."""
+        self._stopped = True
+        self._items.clear()
 
 
 class _Line:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing.connection import wait
 from typing import Any
 
 from geodiff_plugin._signals import stop
@@ -45,19 +42,3 @@ def ending_on_sigterm() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-@contextmanager
-def ending_with_parent() -> Iterator[None]:
-    """Of a helping process: only its parent ends it, by SIGTERM, or by being gone."""
-    parent = multiprocessing.parent_process()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too
-    if parent is not None:
-        threading.Thread(target=_wait_for, args=(parent.sentinel,), daemon=True).start()
-    with ending_on_sigterm():
-        yield
-
-
-def _wait_for(parent: Any) -> None:
-    wait([parent])
-    os.kill(os.getpid(), signal.SIGTERM)

@@ -179,6 +179,41 @@ def test_asked_to_end_it_clears_away_what_it_began(finished, tmp_path):
     assert not left
 
 
+WITHOUT_GUARD = """
+import sys
+from geodiff_plugin.cli.app import main
+from geodiff_plugin.jobs.separate import SeparateProcess
+
+def call(process, *args):
+    if KILLS:
+        process._process.kill()
+    record = called(process, *args)
+    print("another process made", record["frame"])
+    return record
+
+called, SeparateProcess.call = SeparateProcess.call, call
+print("the script runs")
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize("kills", [False, True], ids=["alive", "killed"])
+def test_a_script_without_guard_has_frames_by_several_processes(kills, finished, tmp_path):
+    (tmp_path / "script.py").write_text(WITHOUT_GUARD.replace("KILLS", str(kills)))
+    words = [*typed(finished), "--out", tmp_path / "out", "--frames", "f01,f02", "--processes", 2]
+    ran = subprocess.run(
+        [sys.executable, tmp_path / "script.py", *map(str, words)], capture_output=True, text=True
+    )
+    assert ran.returncode in (0, 4) and "Traceback" not in ran.stderr, ran.stderr
+    lines = ran.stdout.splitlines()
+    assert lines.count("the script runs") == 1 and any(line.startswith("2 of 2 frames") for line in lines)
+    assert any(line.startswith("another process made f0") for line in lines) == (not kills)
+    assert ("is made anew: A process beside this one has ended" in ran.stderr) == kills
+    assert [path.name for path in (tmp_path / "out").glob("frames*")] == [JOURNAL]
+    same = (folder / "f01/depth_alone.npy" for folder in (finished / "out", tmp_path / "out"))
+    assert len({path.read_bytes() for path in same}) == 1
+
+
 TOO_MUCH = [lambda: np.empty(1 << 50), lambda: torch.empty(1 << 50)]
 
 

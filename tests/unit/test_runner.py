@@ -1,6 +1,7 @@
 """Jobs that are resumed, divided into shards, killed and that fail."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from geodiff_plugin import InputError
 from geodiff_plugin.jobs import many
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard, fingerprint
 from geodiff_plugin.jobs.runner import Runner, SideBySide
+from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcess
 
 CHILD = """
 import sys, time
@@ -314,3 +316,77 @@ def test_no_more_processes_write_than_cores_and_pairs_allow(
 def test_what_is_no_shard_is_refused(typed):
     with pytest.raises(InputError, match="--shard must be I/N"):
         Shard.of(typed)
+
+
+def by_process(item: Item) -> dict:
+    """What other processes do."""
+    if item.payload == "sleeps":
+        time.sleep(600)
+    if item.payload == "defect":
+        raise KeyError(item.key)
+    if item.payload == "fails":
+        raise ValueError(f"{item.key} has no camera")
+    if item.payload == "kills":
+        os._exit(7)
+    if item.payload == "cannot":
+        raise ProcessEnded("It cannot begin.")
+    return {"by": os.getpid()}
+
+
+def go_beside(folder, payloads, count=2, stage=by_process):
+    processes = [SeparateProcess(__name__) for _ in range(count)]
+    try:
+        with Journal(folder / "job.jsonl") as journal:
+            items = [Item(f"item{n}", payload) for n, payload in enumerate(payloads)]
+            runner = Runner(items, journal, progress=False, survives=(ValueError,))
+            return runner.run_beside(processes, by_process, stage)
+    finally:
+        for process in processes:
+            process.close()
+
+
+def test_other_processes_make_items_too_and_one_journal_has_them_all(tmp_path):
+    def here(item):
+        time.sleep(0.05)
+        return {"by": os.getpid()}
+
+    records = go_beside(tmp_path, [None] * 400, stage=here)
+    assert [record["key"] for record in records] == [f"item{n}" for n in range(400)]
+    assert {record["by"] for record in records} > {os.getpid()}
+    assert len((tmp_path / "job.jsonl").read_text().splitlines()) == 400
+    assert go_beside(tmp_path, [None] * 400, stage=None) == records
+
+
+@pytest.mark.parametrize(("payload", "said"), [("kills", "(exit code 7)"), ("cannot", "It cannot begin.")])
+def test_what_a_lost_process_was_at_is_made_here(payload, said, tmp_path, capsys):
+    records = go_beside(tmp_path, [payload] * 5, stage=lambda item: {"by": os.getpid()})
+    assert [record["by"] for record in records] == [os.getpid()] * 5
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 2 and all("is made anew: " in line and said in line for line in told)
+
+
+def test_a_reason_counts_once_over_all_processes(tmp_path, capsys):
+    with pytest.raises(ValueError, match=r"has no camera The same holds for all 6 items"):
+        go_beside(tmp_path, ["fails"] * 6)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("where", ["here", "beside"])
+def test_a_defect_ends_the_run_and_the_processes(where, tmp_path):
+    def here(item):
+        return by_process(item) if where == "here" else (time.sleep(0.5), {})[1]
+
+    with pytest.raises(KeyError):
+        go_beside(tmp_path, ["defect"] * 1000, stage=here)
+    lines = (tmp_path / "job.jsonl").read_text().splitlines()
+    assert len(lines) < 1000
+
+
+def test_ctrl_c_ends_processes_that_are_at_work(tmp_path):
+    def here(item):
+        raise KeyboardInterrupt
+
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        go_beside(tmp_path, ["sleeps"] * 3, stage=here)
+    assert time.monotonic() - began < 300

@@ -114,7 +114,7 @@ def test_several_processes_work_at_once_and_the_loss_of_one_is_said(tmp_path):
             pool.submit(processes.call, make_and_wait, *files) for files in permutations((first, second))
         ]
         assert len({call.result() for call in calls}) == 2
-    with pytest.raises(ProcessEnded, match=r"A process that writes results has ended \(exit code 3\)"):
+    with pytest.raises(ProcessEnded, match=r"A process beside this one has ended \(exit code 3\)"):
         processes.call(os._exit, 3)
     processes.close()
 
@@ -126,12 +126,16 @@ def test_ctrl_c_and_a_stop_of_the_group_do_not_reach_it(process):
     assert process.call(math.sqrt, 4) == 2
 
 
+BUSY = "import threading, time; threading.Thread(target=process.call, args=(time.sleep, 600)).start(); "
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
-def test_it_ends_when_the_process_that_asks_is_killed():
+@pytest.mark.parametrize("work", ["", BUSY + "time.sleep(1); "], ids=["idle", "busy"])
+def test_it_ends_when_the_process_that_asks_is_killed(work):
     code = (
         "import os; from geodiff_plugin.jobs.separate import SeparateProcess; "
         "process = SeparateProcess('math'); print(process.call(os.getpid), flush=True); "
-        "os.kill(os.getpid(), 9)"
+        f"{work}os.kill(os.getpid(), 9)"
     )
     killed = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=False)
     assert killed.returncode == -signal.SIGKILL
@@ -139,3 +143,54 @@ def test_it_ends_when_the_process_that_asks_is_killed():
     while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
         assert time.monotonic() < until
         time.sleep(0.05)
+
+
+def clears_away(began: str, cleared: str) -> None:
+    open(began, "w").close()
+    try:
+        time.sleep(600)
+    finally:
+        open(cleared, "w").close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM to be caught")
+def test_one_that_is_ended_clears_away_what_it_is_at(tmp_path):
+    began, cleared = tmp_path / "began", tmp_path / "cleared"
+    process = SeparateProcess(__name__)
+    with ThreadPoolExecutor(1) as pool:
+        called = pool.submit(process.call, clears_away, str(began), str(cleared))
+        wait_for(str(began))
+        assert process.alive
+        process.end()
+        with pytest.raises(ProcessEnded, match=r"exit code 143"):
+            called.result()
+    assert cleared.exists() and not process.alive
+    process.close()
+
+
+PROGRAM = """
+import math
+from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcess
+
+math.added = "by the program"
+{guard}
+    process = SeparateProcess("math", extended=True)
+    try:
+        print(process.call(eval, "getattr(__import__('math'), 'added', None)"))
+    except ProcessEnded:
+        print("cannot begin")
+    process.close()
+"""
+GUARDS = {
+    "if __name__ == '__main__':": "by the program",
+    "if True:": "None",  # without a guard it is not run again
+    "if __name__: pass\nif True:": "cannot begin",  # work outside of it does not begin again
+}
+
+
+@pytest.mark.parametrize(("guard", "answer"), GUARDS.items(), ids=["guard", "none", "elsewhere"])
+def test_it_knows_what_a_program_with_a_guard_adds(guard, answer, tmp_path):
+    (tmp_path / "program.py").write_text(PROGRAM.format(guard=guard))
+    for how in (["program.py"], ["-m", "program"]):
+        ran = subprocess.run([sys.executable, *how], capture_output=True, text=True, cwd=tmp_path)
+        assert ran.stdout.splitlines() == [answer], ran.stderr
