@@ -118,7 +118,7 @@ def read_image(
     notes += more
     if is_turned:
         said = f"{name} was turned or mirrored to {upright.width}x{upright.height}, as its EXIF says"
-        notes.append(Message("image.turned", f"{said}; K must belong to the turned image."))
+        notes.append(Message("image.turned", f"{said}; a K that you give must belong to the turned image."))
     return image_01, notes
 
 
