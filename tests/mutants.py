@@ -187,8 +187,8 @@ MUTANTS = [
         ("NORMAL_QUANTILE = 1.2816", "NORMAL_QUANTILE = 1.39"),
         ("noise**2 / 4.0", "noise**2 / 1.0"),
         (
-            "torch.where(black > 0, of_white, of_black)",
-            "torch.where(black > 0, of_black, of_white)",
+            "torch.where(black, of_white, of_black)",
+            "torch.where(black, of_black, of_white)",
         ),
         ("STIFF_SMOOTHNESS = 400.0", "STIFF_SMOOTHNESS = 300.0"),
         ("BLOCK = 0.08", "BLOCK = 0.16"),
@@ -260,7 +260,7 @@ MUTANTS = [
         (", -15.0)", ", 15.0)"),
         ("\nFEW = 0.02", "\nFEW = 0.03"),
         ("\nHALF_KNOWN = 0.1", "\nHALF_KNOWN = 0.12"),
-        ("torch.minimum(best, error), best)", "error, best)"),
+        ("else torch.minimum(best, error)", "else error"),
         (
             "matched = match_exposure(warped[:, channel], left_01[:, channel], seen)",
             "matched = warped[:, channel].clone()",
@@ -300,7 +300,7 @@ MUTANTS = [
     ),
     *of(
         "pose/estimate.py",
-        ("(np.array(ends).reshape(2, 2) + 0.5) * factor - 0.5", "np.array(ends).reshape(2, 2) * factor"),
+        ("px = (pixel + 0.5) * factor - 0.5", "px = pixel * factor"),
         ("ahead[close, 2] * inverse_depth", "np.linalg.norm(ahead[close], axis=1) * inverse_depth"),
     ),
     *of(
@@ -364,7 +364,7 @@ MUTANTS = [
         ("mean / points.inverse_depth", "points.inverse_depth / mean"),
         ("CONFIDENT = 0.5", "CONFIDENT = 0.6"),
         ("POINTS_WRONG = math.log(1.2)", "POINTS_WRONG = math.log(1.3)"),
-        ("resized * matches.inverse_depth", "resized / matches.inverse_depth"),
+        ("_where((depth_m * matches", "_where((depth_m / matches"),
         ("1.0 / sample.nanmedian()", "sample.nanmedian()"),
         tests=CAPTURES,
     ),
@@ -905,7 +905,7 @@ MUTANTS = [
     *of(
         "result/flattening.py",
         ("clamp_min(LEAST_INVERSE) ** 2", "clamp_min(LEAST_INVERSE) ** 0"),
-        ("left_01, DENOISED_EDGE)", "left_01, 1e3 * DENOISED_EDGE)"),
+        ("guide, DENOISED_EDGE)", "guide, 1e3 * DENOISED_EDGE)"),
         tests=(f"{UNIT}flattening.py",),
     ),
     *of(
