@@ -318,11 +318,11 @@ def refine_kernel(
 
 def _made(x: Tensor, affine: AffineState | None, makes: int, metric: MetricMap) -> Tensor:
     """Maps made of other ones, each with its scale, shift and global scale, if these are needed."""
-    x, batch, numbers, raw = x.contiguous(), 1, (x, x, x), False
+    x, batch, numbers, raw = x.contiguous(), 1, [x, x, x], False
     if affine is not None:
         raw, batch = affine.units is None, len(x)
         both = (affine.s_hat, affine.t_hat) if raw else (affine.scale, affine.shift)
-        numbers = *both, affine.g_s
+        numbers = [each.contiguous() for each in (*both, affine.g_s)]  # one number of all maps is expanded
     made, pixels = torch.empty_like(x), x.numel() // batch
     launched_on(x, map_kernel[(triton.cdiv(pixels, PIXELS), batch)])(
         x,

@@ -6,7 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from geodiff_plugin._kernels import without_kernels
-from geodiff_plugin.scale.space import SPACES, MetricMap, smooth_floor
+from geodiff_plugin.scale.space import SPACES, AffineState, MetricMap, smooth_floor
 from tests.kernels.drawn import drawn
 
 
@@ -32,6 +32,18 @@ def test_two_metric_maps_and_back(device, seed, space, positive, size):
     for one, other in zip(found, expected, strict=True):
         # The inverse of a floor near 0 is a difference of large numbers.
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
+
+
+def test_numbers_of_maps_may_be_expanded_or_strided(device):
+    x = torch.rand(3, 1, 5, 7, generator=torch.Generator().manual_seed(0)).to(device)
+    raw = torch.tensor([[0.1, 0.4], [0.2, 0.5], [0.3, 0.6]], device=device)
+    one_of_all = torch.linspace(1.0, 9.0, 5, device=device)[1].expand(3)
+    affine, metric = AffineState(raw[:, 0], raw[:, 1], one_of_all), MetricMap()
+    depth_m = metric(x, affine)
+    back = metric.relative(depth_m, affine)
+    with without_kernels():
+        torch.testing.assert_close(depth_m, metric(x, affine), rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(back, metric.relative(depth_m, affine), rtol=1e-5, atol=1e-5)
 
 
 def test_what_needs_a_gradient_has_one(device):
