@@ -59,7 +59,7 @@ def read_launches() -> list[Launch]:
 def compile_kernels(device: torch.device, tell: Callable[[str], object]) -> None:
     """Compile what a first guided call will launch, where Triton has not yet; ``tell`` hears of it before.
 
-    What a call launches beside that, such as for known points, Triton compiles in the call.
+    Triton compiles other kernels, such as those for known points, in the call that needs them.
     """
     line = compilation_ahead(device)
     if line is None:
@@ -70,7 +70,7 @@ def compile_kernels(device: torch.device, tell: Callable[[str], object]) -> None
 
 
 def _compile_on(device: torch.device, launch: Launch) -> None:
-    """Compile a launch in a thread of its own, whose current device is another one's."""
+    """Compile a launch in a thread, whose current device is not that of the thread that asks."""
     try:
         with torch.cuda.device(device):
             launch.compile()

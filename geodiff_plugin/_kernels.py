@@ -86,7 +86,7 @@ def launched_on(tensor: torch.Tensor, launch: Callable[..., Any]) -> Callable[..
     """``kernel[grid]`` on the device of a tensor: Triton's own launch is on the current device."""
 
     def launched(*args: Any, **kwargs: Any) -> None:
-        if not tensor.is_cuda:  # Triton's interpreter does not know it
+        if not tensor.is_cuda:  # Triton's interpreter does not know this option
             kwargs.pop("launch_cooperative_grid", None)
         with torch.cuda.device_of(tensor):
             launch(*args, **kwargs)

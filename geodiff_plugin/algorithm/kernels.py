@@ -111,7 +111,10 @@ def _left_over(data, field, x, shared, sample, held, p, n):
 
 @triton.jit
 def _cauchy_weight(weight, noise, doubt, reach, doubted, left_over, shared, sample, p, n):
-    """The weight of observations in the next round; a doubt is nothing (0), a sample's (1), a pixel's (2)."""
+    """The weight of observations in the next round.
+
+    ``doubted`` is 0 where there is no ``doubt``, 1 where it has a value per sample, 2 where per pixel.
+    """
     deviation = tl.load(noise + shared * n + p, p < n, 1.0)
     of_pixel = doubted // 2
     of_fitted = tl.load(doubt + shared * (1 + (n - 1) * of_pixel) + p * of_pixel, p < n, 0.0)
@@ -530,7 +533,7 @@ def _scratch_size(batch: int, fields: int, pixels: Sequence[int]) -> int:
 def _launch(
     read: _Read, written: tuple[Tensor, Tensor, Tensor], counts: _Counts, reach: float | None = None
 ) -> None:
-    """``solve_kernel`` into field, support and weights; the latter two, and ``reach``, are robust solves'."""
+    """``solve_kernel`` into field, support and weights; without ``reach`` it is not robust: field only."""
     batch, _, height, width = read.weight.shape
     pixels = [rows * columns for rows, columns in _sizes(height, width, not counts.given)]
     fields = batch * counts.channels

@@ -80,7 +80,8 @@ class SeparateProcess:
         """``function(*args)``, a function of a module; waits for it, without Python's lock.
 
         Raises:
-            ProcessEnded: there is no answer, and will be none to further calls.
+            ProcessEnded: there is no answer, and will be none to further calls. A function that raises it
+                ends the process.
             Exception: what the function raised, with its traceback as a note.
         """
         assert self._process.stdin is not None and self._process.stdout is not None
@@ -93,6 +94,8 @@ class SeparateProcess:
             raise ProcessEnded(f"{ended} Is there enough memory?") from error
         for message in outcome.warned:
             warn(message)
+        if isinstance(outcome.error, ProcessEnded):  # idle, it would still count as alive
+            self.end()
         if outcome.error is not None:
             raise outcome.error
         return outcome.answer

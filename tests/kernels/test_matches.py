@@ -21,13 +21,13 @@ SIZES = st.tuples(st.integers(1, 40), st.integers(1, 40))
 
 @pytest.fixture(scope="module", autouse=True)
 def small_tiles(device):
-    """Tiles of so few pixels that a small grid has several."""
+    """Tiles of so few rows and columns that a small grid has several down and across."""
     from geodiff_plugin.matching import window_kernels
     from geodiff_plugin.result import flattening_kernels, grounds_kernels
 
     with pytest.MonkeyPatch.context() as patch:
         for module in (window_kernels, flattening_kernels, grounds_kernels):
-            patch.setattr(module, "TILE", (16, 64))
+            patch.setattr(module, "TILE", (16, 32))
         yield
 
 

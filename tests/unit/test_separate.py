@@ -168,6 +168,20 @@ def test_one_that_is_ended_clears_away_what_it_is_at(tmp_path):
     process.close()
 
 
+def cannot_begin() -> None:
+    raise ProcessEnded("It cannot begin.")
+
+
+def test_one_whose_function_says_that_it_has_ended_is_ended():
+    process = SeparateProcess(__name__)
+    with pytest.raises(ProcessEnded, match="It cannot begin"):
+        process.call(cannot_begin)
+    with pytest.raises(ProcessEnded, match="has ended"):
+        process.call(math.sqrt, 4)
+    assert not process.alive
+    process.close()
+
+
 PROGRAM = """
 import math
 from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcess
