@@ -274,7 +274,7 @@ def _in_processes(
             return make(item)
 
     try:
-        return runner.run_beside(helpers, helping, make_here)
+        return runner.run_with(helpers, helping, make_here)
     finally:
         close_all(helpers)
 
@@ -285,7 +285,7 @@ def _help(options: CaptureOptions, keys: RunKeys, count: int, item: Item) -> Rec
         try:
             capture, pipe = _ready(options, keys)
         except Exception as error:  # for example of a prior that only the first process knows
-            raise ProcessEnded(f"A process beside this one cannot begin: {error}") from error
+            raise ProcessEnded(f"A helper process cannot begin: {error}") from error
         return _make_frame(capture, options, lambda: pipe, item)
 
 

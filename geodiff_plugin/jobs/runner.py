@@ -105,7 +105,7 @@ class Runner:
                 release(item)
         return self._records()
 
-    def run_beside(
+    def run_with(
         self, processes: Sequence[SeparateProcess], function: Callable[[Item], Record], stage: Stage
     ) -> list[Record]:
         """As ``run(stage)``, while each of ``processes`` calls ``function`` likewise with an item at a time.

@@ -90,7 +90,7 @@ class SeparateProcess:
             self._process.stdin.flush()
             outcome: _Outcome = pickle.load(self._process.stdout)
         except (OSError, EOFError, pickle.UnpicklingError) as error:
-            ended = f"A process beside this one has ended (exit code {self._process.wait()})."
+            ended = f"A helper process has ended (exit code {self._process.wait()})."
             raise ProcessEnded(f"{ended} Is there enough memory?") from error
         for message in outcome.warned:
             warn(message)

@@ -208,7 +208,7 @@ def test_a_script_without_guard_has_frames_by_several_processes(kills, finished,
     lines = ran.stdout.splitlines()
     assert lines.count("the script runs") == 1 and any(line.startswith("2 of 2 frames") for line in lines)
     assert any(line.startswith("another process made f0") for line in lines) == (not kills)
-    assert ("is made anew: A process beside this one has ended" in ran.stderr) == kills
+    assert ("is made anew: A helper process has ended" in ran.stderr) == kills
     assert [path.name for path in (tmp_path / "out").glob("frames*")] == [JOURNAL]
     same = (folder / "f01/depth_alone.npy" for folder in (finished / "out", tmp_path / "out"))
     assert len({path.read_bytes() for path in same}) == 1

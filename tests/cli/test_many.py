@@ -164,7 +164,7 @@ def test_a_process_that_writes_and_has_ended_ends_the_run_and_the_same_command_g
     beside_gpu(end, writers=1)
     answer = geodiff(*COMMAND)
     assert answer.code == 2 and answer.err.count("geodiff: ") == 1
-    assert "A process beside this one has ended (exit code 9). Is there enough memory?" in answer.err
+    assert "A helper process has ended (exit code 9). Is there enough memory?" in answer.err
     assert Path("out/a/report.json").exists() and not Path("out/b").exists()
     monkeypatch.setattr(many, "leaves_cpu_free", lambda device: False)
     answer = geodiff(*COMMAND)

@@ -339,7 +339,7 @@ def go_beside(folder, payloads, count=2, stage=by_process):
         with Journal(folder / "job.jsonl") as journal:
             items = [Item(f"item{n}", payload) for n, payload in enumerate(payloads)]
             runner = Runner(items, journal, progress=False, survives=(ValueError,))
-            return runner.run_beside(processes, by_process, stage)
+            return runner.run_with(processes, by_process, stage)
     finally:
         for process in processes:
             process.close()

@@ -114,7 +114,7 @@ def test_several_processes_work_at_once_and_the_loss_of_one_is_said(tmp_path):
             pool.submit(processes.call, make_and_wait, *files) for files in permutations((first, second))
         ]
         assert len({call.result() for call in calls}) == 2
-    with pytest.raises(ProcessEnded, match=r"A process beside this one has ended \(exit code 3\)"):
+    with pytest.raises(ProcessEnded, match=r"A helper process has ended \(exit code 3\)"):
         processes.call(os._exit, 3)
     processes.close()
 
