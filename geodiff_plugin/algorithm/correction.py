@@ -274,7 +274,8 @@ def prior_error(
     trusted = torch.cat([weight_of_black, observed.weight - weight_of_black])
     of_black, of_white = _stiff(observed, trusted, first, config).field.chunk(2)
     error = _spread(torch.where(black, of_white, of_black) - observed.residual, observed)
-    share = ((observed.weight > 0).sum((1, 2, 3), keepdim=True) / FEW_POINTS).clamp_max(1.0)
+    count = (observed.weight > 0).sum((1, 2, 3), keepdim=True, dtype=torch.float32)
+    share = (count / FEW_POINTS).clamp_max(1.0)
     return error**share * MOST_ERROR ** (1.0 - share)
 
 
