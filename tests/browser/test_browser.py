@@ -47,11 +47,13 @@ def field(page, name: str):
 
 
 def upload(page, paths) -> None:
-    """Give the files and wait until the page shows each: a picture, or a file's row."""
+    """Give the files and wait until the page shows each, a picture or a file's row, and has noticed it."""
     for name, path in zip(("left", "right", "calibration"), paths, strict=False):
+        page.evaluate("window.changed = false")
         page.locator(f"#{name} input[type=file]").first.set_input_files(str(path))
         shown = "img" if name != "calibration" else f'[aria-label="{Path(path).name}"]'
         page.wait_for_selector(f"#{name} {shown}")
+        page.wait_for_function("window.changed")  # later it would make the next result one of earlier inputs
 
 
 def download(page, name: str, folder: Path) -> Path:
