@@ -6,7 +6,6 @@ that do not need Python's lock, so threads share it well.
 
 from __future__ import annotations
 
-import importlib
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +18,7 @@ from typing import Any
 import torch
 
 from geodiff_plugin._kernels import compilation_ahead
+from geodiff_plugin._lazy import imported
 from geodiff_plugin._threads import available_cores
 
 #: What a guided call of a rectified pair launches: ``python -m tests.benchmarks.first_launches --write``.
@@ -45,7 +45,7 @@ class Launch:
 
     def compile(self) -> None:
         """Compile it for the current device, or load it from Triton's cache."""
-        kernel = getattr(importlib.import_module(f"{__package__}.{self.module}"), self.kernel)
+        kernel = imported(f"{self.module}.{self.kernel}")
         arguments = [getattr(torch, each) if isinstance(each, str) else each for each in self.arguments]
         options = {k: tuple(v) if isinstance(v, list) else v for k, v in self.options.items()}
         kernel.warmup(*arguments, grid=(1,), **options)

@@ -28,6 +28,12 @@ def importer(package: str, module_of: Mapping[str, str]) -> Callable[[str], Any]
     return get
 
 
+def imported(where: str) -> Any:
+    """Something of this package by its dotted name (``cli.info.run_info``), imported now."""
+    module, _, name = where.rpartition(".")
+    return getattr(importlib.import_module(f"geodiff_plugin.{module}"), name)
+
+
 #: Whether ``uncollected`` has done so. (``gc.get_freeze_count`` would count the objects one by one.)
 _left_out = False
 

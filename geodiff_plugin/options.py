@@ -6,7 +6,6 @@ Nothing here imports torch: ``geodiff --help`` and what is wrong with an option 
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import json
 import re
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number, check_positive, refuse
+from geodiff_plugin._lazy import imported
 
 if TYPE_CHECKING:
     from geodiff_plugin.config import GuidanceConfig
@@ -87,12 +87,6 @@ class OptionRules:
 def rules_of(field: Field[Any]) -> OptionRules | None:
     """The rules of an option; ``None`` for a field that ``declare`` did not make."""
     return field.metadata.get("rules")
-
-
-def imported(where: str) -> Any:
-    """Something of this package by its dotted name (``cli.info.run_info``), imported now."""
-    module, _, name = where.rpartition(".")
-    return getattr(importlib.import_module(f"geodiff_plugin.{module}"), name)
 
 
 def on_ray(name: str) -> Any:

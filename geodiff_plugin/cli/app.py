@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from geodiff_plugin._lazy import uncollected
+from geodiff_plugin._lazy import imported, uncollected
 from geodiff_plugin.cli.commands import new_group
 from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions, start_pair, with_folder
 from geodiff_plugin.jobs.telling import say, silent
@@ -26,7 +26,6 @@ from geodiff_plugin.options import (
     SpeedOptions,
     declare,
     help_of,
-    imported,
 )
 
 _out = partial(declare, panel=OUTPUT)

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from geodiff_plugin._lazy import imported
 from geodiff_plugin.options import (
     DTYPES,
     OTHERS,
@@ -24,7 +25,6 @@ from geodiff_plugin.options import (
     engine_option,
     flag_of,
     gpus_option,
-    imported,
     rules_of,
     workers_option,
 )

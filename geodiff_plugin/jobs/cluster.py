@@ -18,6 +18,7 @@ import ray.data
 from tqdm import tqdm
 
 from geodiff_plugin._checks import InputError, refuse
+from geodiff_plugin._lazy import imported
 from geodiff_plugin._threads import available_cores
 from geodiff_plugin.formats.out import OutFolder
 from geodiff_plugin.jobs.failures import Failures, full_disk
@@ -30,7 +31,6 @@ from geodiff_plugin.jobs.ray import Done, Workers, attempt, encoded, guided_refs
 from geodiff_plugin.jobs.rows import GuidedPair
 from geodiff_plugin.jobs.telling import say
 from geodiff_plugin.jobs.writing import write_row
-from geodiff_plugin.options import imported
 
 #: Rows of a Parquet file at most: many small files are slow to list and to read.
 MOST_ROWS_PER_FILE = 64

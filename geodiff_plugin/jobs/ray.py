@@ -24,11 +24,10 @@ import ray
 import ray.data
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin._lazy import uncollected
+from geodiff_plugin._lazy import imported, uncollected
 from geodiff_plugin.jobs.failures import full_disk
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import PairRef
-from geodiff_plugin.options import imported
 
 if TYPE_CHECKING:
     from geodiff_plugin.jobs.finished import Row

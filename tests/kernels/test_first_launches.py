@@ -73,11 +73,10 @@ def test_a_kernel_that_does_not_compile_is_left_to_the_call(compiled, monkeypatc
 def test_a_launch_gives_triton_types_numbers_and_options(monkeypatch):
     asked = []
     kernel = SimpleNamespace(warmup=lambda *arguments, **options: asked.append((arguments, options)))
-    monkeypatch.setattr(
-        _compilation.importlib, "import_module", lambda name: SimpleNamespace(**{name: kernel})
-    )
-    name = "geodiff_plugin.matching.kernels"
-    Launch("matching.kernels", name, ["float32", 16, 0.5], {"DOWN": [1, 0], "num_warps": 4}).compile()
+    monkeypatch.setattr(_compilation, "imported", {"matching.kernels.paths_kernel": kernel}.__getitem__)
+    Launch(
+        "matching.kernels", "paths_kernel", ["float32", 16, 0.5], {"DOWN": [1, 0], "num_warps": 4}
+    ).compile()
     assert asked == [((torch.float32, 16, 0.5), {"grid": (1,), "DOWN": (1, 0), "num_warps": 4})]
 
 
