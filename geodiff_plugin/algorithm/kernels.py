@@ -46,10 +46,10 @@ GATHERED = tl.constexpr(256)
 #: As ``tiny`` of the reference: a channel that has converged stays where it is.
 TINY = tl.constexpr(1e-20)
 
-_TENSORS = ["data", "weight", "across", "down", "start", "noise", "doubt", "smoothness", "inertia"]
+_TENSORS = ["data", "weight", "across", "down", "start", "noise", "error", "smoothness", "inertia"]
 _WRITTEN = ["field", "support", "weights", "scratch", "arrivals"]
 _SIZES = ["height", "width", "batch", "parts", "levels"]
-_COUNTS = ["most", "passes", "rounds", "first_steps", "steps", "given", "local", "doubted"]
+_COUNTS = ["most", "passes", "rounds", "first_steps", "steps", "given", "local", "error_kind"]
 
 
 @triton.jit
@@ -110,22 +110,22 @@ def _left_over(data, field, x, shared, sample, held, p, n):
 
 
 @triton.jit
-def _cauchy_weight(weight, noise, doubt, reach, doubted, left_over, shared, sample, p, n):
+def _cauchy_weight(weight, noise, error, reach, error_kind, left_over, shared, sample, p, n):
     """The weight of observations in the next round.
 
-    ``doubted`` is 0 where there is no ``doubt``, 1 where it has a value per sample, 2 where per pixel.
+    ``error_kind`` is 0 where there is no ``error``, 1 where it has a value per sample, 2 where per pixel.
     """
     deviation = tl.load(noise + shared * n + p, p < n, 1.0)
-    of_pixel = doubted // 2
-    of_fitted = tl.load(doubt + shared * (1 + (n - 1) * of_pixel) + p * of_pixel, p < n, 0.0)
-    of_fitted = tl.where(doubted > 0, of_fitted, 0.0)
+    of_pixel = error_kind // 2
+    of_fitted = tl.load(error + shared * (1 + (n - 1) * of_pixel) + p * of_pixel, p < n, 0.0)
+    of_fitted = tl.where(error_kind > 0, of_fitted, 0.0)
     ratio = left_over / (reach * tl.sqrt(deviation * deviation + of_fitted * of_fitted))
     return tl.load(weight + sample * n + p, p < n, 0.0) / (1.0 + ratio * ratio)
 
 
 @triton.jit
 def _robust_tile(
-    data, weight, noise, doubt, reach, doubted, inertia, field, system, shared, sample, p, part, turn, n,
+    data, weight, noise, error, reach, error_kind, inertia, field, system, shared, sample, p, part, turn, n,
     batch, channels, most, local,
 ):  # fmt: skip
     """Weight and pull of a round of a pass; a pass begins with what the ones before have left of the data."""
@@ -136,7 +136,7 @@ def _robust_tile(
         held = tl.where(turn > 0, channels, 1)
         x = system + (3 + most) * batch * n
         u, done, left_over = _left_over(data, field, x, shared, sample, held, p, n)
-        weights = _cauchy_weight(weight, noise, doubt, reach, doubted, left_over, shared, sample, p, n)
+        weights = _cauchy_weight(weight, noise, error, reach, error_kind, left_over, shared, sample, p, n)
         done += tl.where(turn > 0, 0.0, u)
     if turn == 0:
         tl.store(field + own, done, inside)
@@ -404,14 +404,14 @@ def _coarsen(scratch, arrivals, expected, height, width, batch, channels, stored
 
 @triton.jit
 def _finish_tile(
-    data, weight, noise, doubt, reach, doubted, x, field, support, weights, shared, sample, p, n, most,
+    data, weight, noise, error, reach, error_kind, x, field, support, weights, shared, sample, p, n, most,
     ROBUST: tl.constexpr,
 ):  # fmt: skip
     """What a launch returns."""
     inside, own = p < n, sample * n + p
     if ROBUST:
         u, done, left_over = _left_over(data, field, x, shared, sample, most, p, n)
-        found = _cauchy_weight(weight, noise, doubt, reach, doubted, left_over, shared, sample, p, n)
+        found = _cauchy_weight(weight, noise, error, reach, error_kind, left_over, shared, sample, p, n)
         tl.store(weights + own, found, inside)
         tl.store(field + own, done + u, inside)
         if most > 1:
@@ -425,9 +425,9 @@ def _finish_tile(
 
 @triton.jit(do_not_specialize=_SIZES + _COUNTS, do_not_specialize_on_alignment=_TENSORS + _WRITTEN)
 def solve_kernel(
-    data, weight, across, down, start, noise, doubt, smoothness, inertia,
+    data, weight, across, down, start, noise, error, smoothness, inertia,
     field, support, weights, scratch, arrivals, reach,
-    height, width, batch, parts, levels, most, passes, rounds, first_steps, steps, given, local, doubted,
+    height, width, batch, parts, levels, most, passes, rounds, first_steps, steps, given, local, error_kind,
     ROBUST: tl.constexpr, TILE: tl.constexpr, ALONE: tl.constexpr,
 ):  # fmt: skip
     """All passes of ``solve_robust``, or ``solve_field``, whose ``weight`` and pull ``data`` are given.
@@ -452,7 +452,7 @@ def solve_kernel(
             )  # fmt: skip
             if ROBUST:
                 _robust_tile(
-                    data, weight, noise, doubt, reach, doubted, inertia + of_pass, field, scratch, shared,
+                    data, weight, noise, error, reach, error_kind, inertia + of_pass, field, scratch, shared,
                     sample, p, part, again, n, batch, channels, most, local,
                 )  # fmt: skip
             else:
@@ -476,7 +476,7 @@ def solve_kernel(
         sample, p = tile // tiles, (tile % tiles) * TILE + tl.arange(0, TILE)
         shared = sample % parts
         _finish_tile(
-            data, weight, noise, doubt, reach, doubted, x, field, support, weights, shared, sample, p, n,
+            data, weight, noise, error, reach, error_kind, x, field, support, weights, shared, sample, p, n,
             most, ROBUST,
         )  # fmt: skip
 
@@ -498,7 +498,7 @@ class _Read(NamedTuple):
     down: Tensor  # (parts, 1, H - 1, W)
     start: Tensor  # as the field
     noise: Tensor  # (parts, 1, H, W)
-    doubt: Tensor  # (parts, 1, 1, 1), or (parts, 1, H, W)
+    error: Tensor  # (parts, 1, 1, 1), or (parts, 1, H, W)
     smoothness: Tensor  # (passes, parts, 1, H, W), or of pixels (1, 1)
     inertia: Tensor  # as smoothness
 
@@ -513,7 +513,7 @@ class _Counts(NamedTuple):
     steps: int
     given: bool  # whether ``start`` is
     local: bool  # whether there is a smoothness per pixel
-    doubted: int = 0  # as ``_cauchy_weight`` has it
+    error_kind: int = 0  # as ``_cauchy_weight`` has it
 
 
 def _sizes(height: int, width: int, levels: bool) -> list[tuple[int, int]]:
@@ -579,12 +579,12 @@ def solve_robust(system: RobustSystem, rounds: int, steps: int, with_support: bo
     field, weights, *supports = trusted.new_empty(2 + with_support, *trusted.shape).unbind()
     support = supports[0] if with_support else None
     stiffness, inertia = (_of_batch(part, parts, axis=1) for part in (system.smoothness, system.inertia))
-    noise, doubt, doubted = system.noise.contiguous(), data, 0
-    if system.doubt is not None:
-        doubt = _of_batch(system.doubt, parts)
-        doubted = 1 if doubt.shape[-2:] == (1, 1) else 2
-    read = _Read(data, trusted, across, down, data, noise, doubt, stiffness, inertia)
+    noise, error, error_kind = system.noise.contiguous(), data, 0
+    if system.error is not None:
+        error = _of_batch(system.error, parts)
+        error_kind = 1 if error.shape[-2:] == (1, 1) else 2
+    read = _Read(data, trusted, across, down, data, noise, error, stiffness, inertia)
     local, channels = stiffness.shape[-2:] != (1, 1), 1 + with_support
-    counts = _Counts(channels, len(stiffness), rounds, solver.COARSEST_STEPS, steps, False, local, doubted)
+    counts = _Counts(channels, len(stiffness), rounds, solver.COARSEST_STEPS, steps, False, local, error_kind)
     _launch(read, (field, weights if support is None else support, weights), counts, system.reach)
     return RobustField(field, weights, support)

@@ -122,7 +122,7 @@ class RobustSystem:
         trusted: ``t (B, 1, H, W)``, the weight of an observation that is met. Of ``n B`` samples it is ``n``
             sets of weights, one after the other, for the same observations.
         noise: ``(B, 1, H, W)`` standard deviation of an observation.
-        doubt: ``(B, 1, 1, 1)`` or ``(B, 1, H, W)``, that of what is fitted to them; ``None`` is 0.
+        error: ``(B, 1, 1, 1)`` or ``(B, 1, H, W)``, that of what is fitted to them; ``None`` is 0.
         reach: ``w`` is so many times the two deviations together: there an observation counts half.
         links: ``g``, across and down as in ``FieldSystem``.
         smoothness: ``a`` of every pass, ``(P, B, 1, 1, 1)``, or ``(P, B, 1, H, W)``: between two pixels the
@@ -133,7 +133,7 @@ class RobustSystem:
     data: Tensor
     trusted: Tensor
     noise: Tensor
-    doubt: Tensor | None
+    error: Tensor | None
     reach: float
     links: tuple[Tensor, Tensor]
     smoothness: Tensor
@@ -142,7 +142,7 @@ class RobustSystem:
     @property
     def width(self) -> Tensor:
         """``w (B, 1, H, W)``."""
-        both = self.noise if self.doubt is None else (self.noise**2 + self.doubt**2).sqrt()
+        both = self.noise if self.error is None else (self.noise**2 + self.error**2).sqrt()
         return self.reach * both
 
 

@@ -80,9 +80,9 @@ def known_kernel(
     tl.store(share + sample + p, tl.minimum(known, 1.0), inside)
 
 
-@triton.jit(do_not_specialize=["height", "width"], do_not_specialize_on_alignment=["sure", "doubt"])
+@triton.jit(do_not_specialize=["height", "width"], do_not_specialize_on_alignment=["sure", "new_deviation"])
 def hidden_kernel(
-    inverse_depth, confidence, deviation, hidden, behind, inverse, sure, doubt, height, width,
+    inverse_depth, confidence, deviation, hidden, behind, inverse, sure, new_deviation, height, width,
     ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """``rows.with_hidden``. Grid: tiles down, tiles across."""
@@ -93,7 +93,7 @@ def hidden_kernel(
     kept = tl.load(inverse_depth + p, inside, 0.0)
     tl.store(inverse + p, tl.where(put, tl.load(behind + p, inside, 0.0), kept), inside)
     tl.store(sure + p, tl.where(put, tl.minimum(known, 1.0) * _HIDDEN_CONFIDENCE, own), inside)
-    tl.store(doubt + p, tl.where(put, 1.0, tl.load(deviation + p, inside, 1.0)), inside)
+    tl.store(new_deviation + p, tl.where(put, 1.0, tl.load(deviation + p, inside, 1.0)), inside)
 
 
 def tiles(size: tuple[int, int]) -> tuple[int, int]:
@@ -116,9 +116,9 @@ def with_hidden(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Inverse depth, confidence and deviation of ``rows.with_hidden``, where the deviation is known."""
     maps = matches.inverse_depth, matches.confidence, deviation, strips.inside, strips.inverse_depth
-    inverse, confidence, doubt = deviation.new_empty(3, *deviation.shape).unbind()
+    inverse, confidence, new_deviation = deviation.new_empty(3, *deviation.shape).unbind()
     launched_on(deviation, hidden_kernel[tiles(matches.size)])(
-        *(each.contiguous() for each in maps), inverse, confidence, doubt, *matches.size,
+        *(each.contiguous() for each in maps), inverse, confidence, new_deviation, *matches.size,
         ROWS=TILE[0], COLUMNS=TILE[1],
     )  # fmt: skip
-    return inverse, confidence, doubt
+    return inverse, confidence, new_deviation

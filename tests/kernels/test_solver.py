@@ -67,11 +67,11 @@ def random_robust_system(
     links = tuple(drawn(batch, 1, *size) ** 4 + 0.01 for size in ((height, width - 1), (height - 1, width)))
     of_pass = (passes, batch, 1, height, width) if local else (passes, batch, 1, 1, 1)
     stiffness, inertia = 20 * drawn(*of_pass) + 0.1, 0.02 * drawn(*of_pass) + 0.01
-    noise, doubt = 0.1 + drawn(batch, 1, height, width), 0.2 * drawn(*of_pass[1:]) if seed % 3 else None
+    noise, error = 0.1 + drawn(batch, 1, height, width), 0.2 * drawn(*of_pass[1:]) if seed % 3 else None
     parts = (data, trusted, noise, *links, stiffness, inertia)
     data, trusted, noise, across, down, stiffness, inertia = (part.to(device) for part in parts)
-    doubt = None if doubt is None else doubt.to(device)
-    return RobustSystem(data, trusted, noise, doubt, 1.5, (across, down), stiffness, inertia)
+    error = None if error is None else error.to(device)
+    return RobustSystem(data, trusted, noise, error, 1.5, (across, down), stiffness, inertia)
 
 
 def assert_same_robust_fields(system: RobustSystem, rounds: int, steps: int, with_support: bool) -> None:
