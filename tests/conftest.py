@@ -22,12 +22,6 @@ def pytest_collection_finish():
     gc.enable()
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _rendered_pairs():
-    """The data set ``synthetic:N`` is registered by an import."""
-    import tests.scenes.dataset  # noqa: F401
-
-
 @pytest.fixture(scope="session")
 def make_pipeline():
     """Factory of tiny random Marigold pipelines; the same seed gives the same weights."""

@@ -29,6 +29,7 @@ from geodiff_plugin.evaluation.options import COMMANDS, PosesOptions
 from geodiff_plugin.evaluation.pairs import CHANGES, FLATNESS, changes_table
 from geodiff_plugin.evaluation.paper import LAYOUTS, layout_table
 from geodiff_plugin.evaluation.poses import run_poses
+import tests.scenes.dataset  # noqa: F401  registers synthetic pairs
 from tests.evaluating import invoke, write_scenes
 
 
