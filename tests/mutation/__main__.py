@@ -69,9 +69,8 @@ def _name(options: argparse.Namespace) -> str:
 
 
 def _key(mutant: Mutant) -> str:
-    """Identifies a mutant of the code as it is: another version of the file is another mutant."""
-    digest = hashlib.sha256((ROOT / mutant.file).read_bytes()).hexdigest()[:12]
-    return f"{mutant.file}:{mutant.operator}:{mutant.occurrence}:{digest}"
+    """Identifies a mutant by its code, so that another version of the file is another mutant."""
+    return f"{mutant.file}:{hashlib.sha256(mutant.code.encode()).hexdigest()[:16]}"
 
 
 def _register(database: WorkDB, mutants: list[Mutant], retry: bool) -> None:

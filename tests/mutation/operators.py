@@ -83,6 +83,13 @@ class InvertRatio(Operator):
         return ()
 
 
+#: Functions whose result does not depend on the order of their arguments.
+SYMMETRIC = set(
+    "minimum maximum min max hypot addcmul addcmul_ vecdot dot equal array_equal allclose isclose samefile "
+    "logical_and logical_or union intersection".split()
+)
+
+
 class ExchangeArguments(Operator):
     """``f(a, b)`` becomes ``f(b, a)``, for neighbouring positional arguments."""
 
@@ -98,6 +105,9 @@ class ExchangeArguments(Operator):
     @staticmethod
     def _pairs(node):
         if node.type != "arglist" or node.parent.type not in ("trailer", "power", "atom_expr"):
+            return
+        function = node.parent.get_previous_sibling()
+        if function is not None and function.get_last_leaf().value in SYMMETRIC:
             return
         arguments = [child for child in node.children if child.type != "operator"]
         for first, second in zip(arguments, arguments[1:], strict=False):

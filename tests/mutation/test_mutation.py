@@ -34,6 +34,11 @@ def test_an_operator_makes_the_fault_it_describes(before, after, operator):
     assert after in [text.replace("( ", "(") for text in made]
 
 
+def test_the_order_of_a_minimum_is_no_fault():
+    made = {name for name, _, _ in positions("x = torch.minimum(a, b)")}
+    assert "ExchangeArguments" not in made
+
+
 def test_annotations_and_logging_are_left_alone():
     source = textwrap.dedent(
         """

@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+import tests.scenes.dataset  # noqa: F401  registers synthetic pairs
 from geodiff_plugin.cli.eval import eval_app
 from geodiff_plugin.cli.terminal import EXIT_SOME_FAILED
 from geodiff_plugin.evaluation import experiment, pairs, paper
@@ -29,7 +30,6 @@ from geodiff_plugin.evaluation.options import COMMANDS, PosesOptions
 from geodiff_plugin.evaluation.pairs import CHANGES, FLATNESS, changes_table
 from geodiff_plugin.evaluation.paper import LAYOUTS, layout_table
 from geodiff_plugin.evaluation.poses import run_poses
-import tests.scenes.dataset  # noqa: F401  registers synthetic pairs
 from tests.evaluating import invoke, write_scenes
 
 
