@@ -162,7 +162,7 @@ def run_job(
         report(share, name)
 
     for name, most in LIMITS.items():
-        check_number(getattr(options, name) or 0, FIELD_NAMES.get(name, name), 0, most, integer=True)
+        check_number(getattr(options, name) or 0, FIELD_NAMES.get(name, name), 0, most)
     options.check(lambda option: FIELD_NAMES.get(option.name, option.name))
     folder, log = OutFolder(_new_folder()), JobLog()
     with collected_warnings(silent), folder:  # the log has them

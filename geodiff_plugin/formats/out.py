@@ -85,9 +85,10 @@ def _hidden(target: Path) -> Path:
 def check_out(path: Path) -> Path:
     """The place that an output folder has or will have, links followed."""
     try:
-        target = path.resolve()
-        with suppress(FileNotFoundError):
-            os.stat(_beside(target))  # the longest name that will be needed
+        target = Path(os.path.realpath(path))  # Path.resolve raises RuntimeError for a link to itself
+        for place in (target, _beside(target)):  # the latter has the longest name that will be needed
+            with suppress(FileNotFoundError):
+                os.stat(place)
     except OSError as error:
         unwritable(path, error)
     if target.exists() and not target.is_dir():

@@ -87,10 +87,9 @@ def _compressed(body: bytes, layout: _Layout) -> np.ndarray:
     plain = _decompressed(body[SIZES_BYTES : SIZES_BYTES + packed], size)
     columns, start = {}, 0
     for field in layout.row.names or ():
-        kind, shape = layout.row[field].subdtype or (layout.row[field], (1,))
-        count = layout.points * shape[0]
-        columns[field] = np.frombuffer(plain, kind, count, start).reshape(layout.points, -1)[:, 0]
-        start += count * kind.itemsize
+        kind = layout.row[field]  # of as many numbers as the field has
+        columns[field] = np.frombuffer(plain, kind, layout.points, start).reshape(layout.points, -1)[:, 0]
+        start += layout.points * kind.itemsize
     return np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
 
 

@@ -218,7 +218,9 @@ def read_bundler(path: Path, images_at: Path | None = None) -> Layout | None:
 def _bundler(file: Path, counts: str, lines: Iterator[str], images_at: Path | None) -> Layout:
     above = (file.parent, file.parent.parent)
     names_of = [
-        folder / name for folder in above for name in (f"{file}.list.txt", f"{file.stem}.list.txt", *LISTS)
+        folder / name
+        for folder in above
+        for name in (f"{file.name}.list.txt", f"{file.stem}.list.txt", *LISTS)
     ]
     listed = next((each for each in names_of if each.is_file()), None)
     if listed is None:

@@ -35,8 +35,8 @@ from geodiff_plugin.options import (
     workers_option,
 )
 
-#: What is read of a COLMAP model, the one kind of calibration that is a folder.
-MODEL_FILES = ("cameras.txt", "images.txt")
+#: What is read of a COLMAP model: texts before binary files.
+MODEL_FILES = (("cameras.txt", "images.txt"), ("cameras.bin", "images.bin"))
 _camera, _output = partial(declare, panel=CAMERAS), partial(declare, panel=OUTPUT)
 _prior, _known = partial(declare, panel=PRIOR), partial(declare, panel=KNOWN_DEPTHS)
 _unposed, _further = partial(declare, panel=UNKNOWN_POSES), partial(declare, panel=FURTHER_VIEWS)
@@ -235,10 +235,10 @@ class DepthOptions(SpeedOptions, RunOptions):
         return named
 
     def read_files(self) -> list[Path]:
-        """Every file that a run reads; of a COLMAP model its texts."""
+        """Every file that a run reads; of a calibration that is a folder those in it."""
         files: list[Path] = []
         for path in (*self.photographs().values(), *(path for _, path in self.other_files())):
-            files += [path / name for name in MODEL_FILES] if path.is_dir() else [path]
+            files += _files_in(path) if path.is_dir() else [path]
         return files
 
     def refuse(self, names: Iterable[str], sentence: str) -> None:
@@ -370,6 +370,13 @@ class DepthOptions(SpeedOptions, RunOptions):
         return way
 
 
+def _files_in(folder: Path) -> list[Path]:
+    """The files of a calibration that is a folder: those of a COLMAP model, or else arrays."""
+    models = [[folder / name for name in names] for names in MODEL_FILES]
+    whole = [files for files in models if all(map(os.path.isfile, files))]
+    return whole[0] if whole else sorted(folder.glob("*.npy")) or models[0]
+
+
 def _flag(name: str) -> str:
     return flag_of(DepthOptions.__dataclass_fields__[name])
 
@@ -385,8 +392,8 @@ def check_files(options: DepthOptions, photographs: bool = True) -> None:
             if a.samefile(b) and not (options.both_in_one and (first, second) == ("LEFT", "RIGHT")):
                 bad_value(second, f"another photograph than {first}", f"{b} for both")
     for name, path in options.other_files():
-        model = any(os.path.exists(path / file) for file in (*MODEL_FILES, "images.bin"))
-        if not (name == "calibration" and model):  # missing files of a model are reported when it is read
+        is_folder = path.is_dir() and any(map(os.path.exists, (*_files_in(path), path / "images.bin")))
+        if not (name == "calibration" and is_folder):  # what a model lacks is reported when it is read
             check_file(path, name)
     if options.into is not None:
         from geodiff_plugin.formats.target import read_target_camera  # imports numpy

@@ -56,7 +56,7 @@ class Provenance:
         """Of a run that is about to begin; before the capture is rescaled."""
         fields = CaptureOptions.__dataclass_fields__
         settings = {flag_of(fields[name]): str(getattr(options, name)) for name in (*OF_POSES, *OF_FRAME)}
-        each = {frame.name: _digests(frame, options.prior_map) for frame in capture.frames}
+        each = {frame.name: _digests(frame, capture.unit, options.prior_map) for frame in capture.frames}
         by_kind = {kind: {name: those[kind] for name, those in each.items()} for kind in KINDS}
         return cls(__version__, settings, by_kind)
 
@@ -107,13 +107,13 @@ def _typed(settings: Mapping[str, str]) -> dict[str, str | None]:
     return {flag: None if value == UNSET else value for flag, value in settings.items()}
 
 
-def _digests(frame: CaptureFrame, prior_maps: Path | None) -> dict[str, str]:
-    """A digest of everything that is read of a frame, by kind."""
+def _digests(frame: CaptureFrame, unit: str | None, prior_maps: Path | None) -> dict[str, str]:
+    """A digest of everything that is read of a frame, by kind; ``unit`` is that of its pose."""
     lens = None if frame.lens is None else (frame.lens.model, frame.lens.coefficients)
     prior_map = None if prior_maps is None else find_map(prior_maps, frame.name)
     return {
         "image": fingerprint(frame.image),
-        "camera": fingerprint(frame.E, frame.K, frame.size, lens, frame.as_stored, frame.index),
+        "camera": fingerprint(frame.E, unit, frame.K, frame.size, lens, frame.as_stored, frame.index),
         "points": fingerprint(frame.points),
         "depth": fingerprint(frame.depth, frame.depth_per_m),
         "prior_map": fingerprint(prior_map),

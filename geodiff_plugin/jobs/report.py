@@ -79,7 +79,9 @@ def used_poses(output: MetricDepthOutput, guidance: GeometryGuidance) -> tuple[n
 
 def _rescaled(E: np.ndarray, output: MetricDepthOutput) -> np.ndarray:
     """A pose of the guidance in the unit of the output."""
-    return E * np.array([1.0, 1.0, 1.0, output.rescaled])
+    rescaled = np.array(E)
+    rescaled[:3, 3] *= output.rescaled
+    return rescaled
 
 
 def verdict_report(output: MetricDepthOutput) -> dict[str, Any]:

@@ -56,8 +56,9 @@ def write_steady_frames(
             scenes = write_steady(frames, picture)
         for i, scene in enumerate(scenes):
             if options.into is not None:
-                depth = np.load(folders[i] / "depth.npy")
-                reports[i]["into"] = write_into(folders[i], depth, frames[i].K, options.into)
+                depth, confidence = (np.load(folders[i] / f"{name}.npy") for name in AGREED[:2])
+                known = depth * (confidence > 0)
+                reports[i]["into"] = write_into(folders[i], known, frames[i].K, options.into)
             note(i, [f"{name}.npy" for name in AGREED], steady={"scene": scene})
     except OSError as error:
         raise InputError(f"--steady ended ({reason_of(error)}); the same command resumes.") from error

@@ -28,8 +28,6 @@ LEAST_DISTANCE = 0.2
 MULTIPLE = 1.6
 #: Matches above this confidence make the spread.
 SPREAD_CONFIDENCE = 0.3
-#: Least spread, in log depth.
-SPREAD_FLOOR = 0.05
 #: The spread is measured at this quantile of the distances: the median would miss that nearly half of the
 #: scene is on a wrong surface.
 SPREAD_SHARE = 0.6
@@ -198,8 +196,7 @@ def reject_reflections(matches: Matches, depth_m: Tensor) -> Tensor:
     middle = counted.nanmedian(1, keepdim=True).values
     apart = (counted - middle).abs()[:, :: 1 + counted.numel() // MOST_SORTED]
     spread = apart.nanquantile(SPREAD_SHARE, 1) / NORMAL_QUANTILE
-    spread = spread.nan_to_num(LARGEST).clamp_min(SPREAD_FLOOR)
-    least = (SPREADS * spread).clamp_min(LEAST_DISTANCE)[:, None, None, None]
+    least = (SPREADS * spread.nan_to_num(LARGEST)).clamp_min(LEAST_DISTANCE)[:, None, None, None]
     behind_in_region, in_region = _window_sum(torch.cat([behind * weight, weight], 1), radius).chunk(2, 1)
     region = behind_in_region / in_region.clamp_min(1.0)
     rejected = ((torch.minimum(region, behind) / least - 1.0) / (MULTIPLE - 1.0)).clamp(0.0, 1.0)

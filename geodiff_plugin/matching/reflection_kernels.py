@@ -21,7 +21,6 @@ _LARGEST = tl.constexpr(reference.LARGEST)
 _SPREAD_CONFIDENCE = tl.constexpr(reference.SPREAD_CONFIDENCE)
 _SPREAD_SHARE = tl.constexpr(reference.SPREAD_SHARE)
 _NORMAL_QUANTILE = tl.constexpr(reference.NORMAL_QUANTILE)
-_SPREAD_FLOOR = tl.constexpr(reference.SPREAD_FLOOR)
 _SPREADS = tl.constexpr(reference.SPREADS)
 _LEAST_DISTANCE = tl.constexpr(reference.LEAST_DISTANCE)
 _MULTIPLE = tl.constexpr(reference.MULTIPLE)
@@ -108,8 +107,7 @@ def spread_kernel(ordered, spread, n):
     below, above, part = rank_of(count, _SPREAD_SHARE)
     near = _distance_at(ordered, count, middle, below)
     found = between(near, _distance_at(ordered, count, middle, above), part) / _NORMAL_QUANTILE
-    found = tl.where(count > 0, found, _LARGEST)
-    tl.store(spread + sample, tl.maximum(found, _SPREAD_FLOOR))
+    tl.store(spread + sample, tl.where(count > 0, found, _LARGEST))
 
 
 @triton.jit(

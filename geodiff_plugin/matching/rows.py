@@ -120,7 +120,7 @@ def _row_shifts(
     shift = raw.astype(np.float32)
     shift /= 16.0
     shift -= np.float32(infinity_px)
-    return shift, (raw > 16 * (lowest - 1)) & (shift >= MIN_SHIFT_PX)
+    return shift, shift >= MIN_SHIFT_PX  # OpenCV puts pixels without a match one pixel before the search
 
 
 def rectified_pictures(native: PosedViews) -> RowPictures | None:

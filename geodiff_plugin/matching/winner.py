@@ -44,9 +44,9 @@ def _around(total: Tensor) -> tuple[Tensor, Tensor]:
 def _position(index: Tensor, sums: Tensor, last: int) -> Tensor:
     """Between planes, ``(H, W)``, from the sums ``(3, H, W)`` of ``_around``."""
     below, best, above = sums
-    offset = 0.5 * (below - above) / (below + above - 2.0 * best).clamp_min(1e-6)
+    offset = 0.5 * (below - above) / (below + above - 2.0 * best)  # half a plane at most, as best is least
     inner = (index > 0) & (index < last)
-    return index + torch.where(inner, offset.clamp(-0.5, 0.5), torch.zeros_like(offset))
+    return index + torch.where(inner, offset, 0.0)
 
 
 def winner_positions(total: Tensor) -> Tensor:

@@ -132,7 +132,7 @@ def _undone(tracks: Tracks, T: np.ndarray) -> Iterator[_Undone]:
     turned, mixed = inverse.copy(), inverse.copy()
     turned[:3, :3] = inverse[:3, :3].T
     yield _Undone(_TRANSPOSED, tracks, np.linalg.inv(turned))
-    mixed[:3, 3] = T[:3, 3]
+    mixed[:3, 3] = -inverse[:3, :3] @ inverse[:3, 3]  # the given one is that of world-to-camera
     yield _Undone(_KEPT_T, tracks, np.linalg.inv(mixed))
     if not np.allclose(tracks.K_left, tracks.K_rights[0], rtol=0.02):
         swapped = replace(tracks, K_left=tracks.K_rights[0], K_rights=tracks.K_left[None])

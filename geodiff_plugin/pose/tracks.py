@@ -469,8 +469,8 @@ def dense_tracks(views: Sequence[GreyImage], depth_m: Tensor, Ts: np.ndarray) ->
     for v, ((image, K_right), T) in enumerate(zip(rights, Ts, strict=True)):
         K_l, K_r, T_r = (torch.as_tensor(m, dtype=torch.float32, device="cpu")[None] for m in (K, K_right, T))
         rays = plane_rays(K_l, K_r, T_r, (size[0], size[1]))
-        uv, z = (part[0].numpy() for part in project_rays(depth_m, rays))
-        visible = (uv >= 0).all(-1) & (uv <= np.array(image.shape[::-1]) - 1).all(-1) & (z > 0)
+        uv = project_rays(depth_m, rays)[0][0].numpy()  # outside of the image for points behind it
+        visible = np.asarray(((uv >= 0) & (uv <= np.array(image.shape[::-1]) - 1)).all(-1))
         right_px[v], seen[v] = _dense_matches(left, image, uv, visible, centres)
     K_rights = np.stack([K_right for _, K_right in rights])
     return Tracks(centres.astype(np.float64), right_px, seen, K, K_rights).seen_anywhere()

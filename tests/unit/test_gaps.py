@@ -95,3 +95,9 @@ def test_a_gap_is_not_hidden_where_the_right_view_would_not_see_the_near_surface
 def test_a_step_that_is_chance_hides_nothing(step, hides):
     shift = np.array([[5.0, 0.0, 5.0 + step]], np.float32)
     assert hidden_pixels(shift, shift > 0).tolist() == [[False, hides, False]]
+
+
+@pytest.mark.parametrize(("width", "hides"), [(1, True), (7, True), (8, True), (9, False), (12, False)])
+def test_a_hidden_gap_is_at_most_two_pixels_wider_than_its_step(width, hides):
+    shift = np.array([[3.0] * 4 + [0.0] * width + [9.0] * 5], np.float32)
+    assert hidden_pixels(shift, shift > 0)[0].tolist() == [hides and not known for known in (shift > 0)[0]]

@@ -1,13 +1,23 @@
 """Whoever waits for kernels to be compiled is told so, and nobody else."""
 
+import importlib.util
 import logging
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import pytest
 import torch
 
 from geodiff_plugin import _kernels
-from geodiff_plugin._kernels import ALWAYS_LAUNCHED, compilation_ahead, use_kernel, without_kernels
+from geodiff_plugin._kernels import (
+    ALWAYS_LAUNCHED,
+    compilation_ahead,
+    kernels_in_use,
+    launch_bound,
+    launched_on,
+    use_kernel,
+    without_kernels,
+)
 from geodiff_plugin.jobs import prior as jobs_prior
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.runtime import guided_call
@@ -94,3 +104,77 @@ def test_a_call_logs_it(pipe, textured_plane, monkeypatch, caplog):
     assert [(r.levelno, r.message) for r in caplog.records if r.name.startswith("geodiff_plugin")] == [
         (logging.INFO, "compiles on cpu")
     ]
+
+
+@pytest.mark.parametrize("spec", [None, object()])
+def test_triton_is_there_if_it_can_be_imported(spec, monkeypatch):
+    asked = []
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: asked.append(name) or spec)
+    assert _kernels.has_triton.__wrapped__() is (spec is not None) and asked == ["triton"]
+
+
+@pytest.mark.parametrize(("value", "interpreted"), [(None, False), ("0", False), ("1", True)])
+def test_triton_interprets_by_its_environment_variable(value, interpreted, monkeypatch):
+    """Then stages take the way of a device, on which launches take the time of small operations."""
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    if value is not None:
+        monkeypatch.setenv("TRITON_INTERPRET", value)
+    assert _kernels.interpreting() is interpreted
+    for kind, bound in (("cpu", interpreted), ("cuda", True), ("mps", True)):
+        assert launch_bound(SimpleNamespace(device=torch.device(kind))) is bound
+
+
+@pytest.mark.parametrize(
+    ("triton", "interpreted", "cuda", "hip", "words"),
+    [
+        (False, True, True, None, "plain torch: Triton is not installed"),
+        (True, True, True, None, "Triton's interpreter, on the CPU"),
+        (True, False, False, None, "plain torch: kernels need CUDA"),
+        (True, False, True, "6.2", "plain torch: kernels need CUDA"),
+        (True, False, True, None, "Triton on CUDA, compiled at the first call on a machine"),
+    ],
+)
+def test_what_stages_run_by_is_put_in_words(triton, interpreted, cuda, hip, words, monkeypatch):
+    monkeypatch.setattr(_kernels, "has_triton", lambda: triton)
+    monkeypatch.setattr(_kernels, "interpreting", lambda: interpreted)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
+    monkeypatch.setattr(torch.version, "hip", hip)
+    assert kernels_in_use() == words
+
+
+def test_no_kernels_are_compiled_for_rocm_and_a_cache_is_looked_into_until_it_is_filled(cache, monkeypatch):
+    (cache / "hash").mkdir()
+    filled = cache / f"hash/{ALWAYS_LAUNCHED}.cubin"
+    filled.touch()
+    assert compilation_ahead(CUDA) is None
+    filled.unlink()
+    assert compilation_ahead(CUDA) is None, "once filled it is not looked into again"
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(cache / "another"))
+    assert compilation_ahead(CUDA)
+    monkeypatch.setattr(torch.version, "hip", "6.2")
+    assert compilation_ahead(CUDA) is None
+
+
+@pytest.mark.parametrize("is_cuda", [True, False])
+def test_a_kernel_is_launched_on_the_device_of_its_tensor(is_cuda, monkeypatch):
+    """The interpreter does not know a cooperative launch."""
+    said, tensor = [], SimpleNamespace(is_cuda=is_cuda)
+
+    @contextmanager
+    def device_of(other):
+        said.append(("enters", other))
+        yield
+        said.append(("leaves", other))
+
+    monkeypatch.setattr(torch.cuda, "device_of", device_of)
+    launched_on(tensor, lambda *given, **options: said.append((given, options)))(
+        1, 2, BLOCK=3, launch_cooperative_grid=True
+    )
+    options = {"BLOCK": 3, "launch_cooperative_grid": True} if is_cuda else {"BLOCK": 3}
+    assert said == [("enters", tensor), ((1, 2), options), ("leaves", tensor)]
+
+
+def test_the_switch_is_turned_back_after_an_error():
+    with pytest.raises(KeyError), without_kernels():
+        raise KeyError
+    assert _kernels._switched_on.get()

@@ -2,17 +2,34 @@
 
 import json
 
+import cv2
 import matplotlib
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from typer.testing import CliRunner
 
+from geodiff_plugin import _strips, plotting
+from geodiff_plugin._checks import InputError
 from geodiff_plugin.cli.eval import eval_app
 from geodiff_plugin.evaluation.datasets import find_pairs, load
 from geodiff_plugin.evaluation.figures import sweep_g_s
 from geodiff_plugin.formats import write_depth_npy
-from geodiff_plugin.plotting import colour_depth, depth_figure, depth_range, grid, ticks
+from geodiff_plugin.plotting import (
+    check_video,
+    colour_depth,
+    colour_share,
+    depth_figure,
+    depth_frames,
+    depth_range,
+    grid,
+    overview,
+    share_figure,
+    shrunk,
+    ticks,
+    write_depth_video,
+)
 from tests.evaluating import write_scenes
 
 
@@ -93,6 +110,307 @@ def test_grid_places_cells_and_titles():
     pixels = np.asarray(sheet)
     assert sheet.size == (6 + 2 * 86, 6 + (80 + 40 + 40) + 3 * (24 + 6))
     assert tuple(pixels[35, 46]) == (255, 0, 0) and (pixels == 77).all(axis=-1).any()
+
+
+def white(pixels: np.ndarray) -> np.ndarray:
+    return (pixels == 255).all(axis=-1)
+
+
+def table(name: str) -> np.ndarray:
+    return (matplotlib.colormaps[name](np.linspace(0, 1, 1024))[:, :3] * 255).round()
+
+
+def place_in(name: str, colours: np.ndarray) -> np.ndarray:
+    """Where on a colour map these colours are, from 0 to 1."""
+    off = np.abs(table(name)[:, None] - colours[None].astype(float)).sum(axis=-1)
+    assert (off.min(axis=0) < 4).all(), "the colours are those of the map"
+    return off.argmin(axis=0) / 1023
+
+
+@pytest.mark.parametrize("strip", [7, 1 << 20])
+def test_every_shade_of_a_map_is_the_place_of_its_logarithm_between_the_ends(strip, monkeypatch):
+    monkeypatch.setattr(_strips, "STRIP_PIXELS", strip)
+    depth = np.geomspace(0.5, 60, 90).reshape(6, 15)
+    near, far = 1.0, 30.0
+    expected = np.clip(np.log(far / depth) / np.log(far / near), 0, 1)
+    np.testing.assert_allclose(
+        place_in("plasma", colour_depth(depth, near, far).reshape(-1, 3)), expected.ravel(), atol=0.01
+    )
+    for top in (1.0, 4.0):
+        values = np.linspace(-0.2 * top, 1.2 * top, 60).reshape(4, 15)
+        values[2, 3] = np.nan
+        colours = colour_share(values, top)
+        known = np.isfinite(values)
+        assert (colours[~known] == 128).all()
+        np.testing.assert_allclose(
+            place_in("YlGnBu_r", colours[known]), np.clip(values[known] / top, 0, 1), atol=0.02
+        )
+    np.testing.assert_array_equal(colour_share(values / 4), colour_share(values, 4.0))
+
+
+def test_the_ends_of_the_colours_leave_two_per_cent_on_either_side():
+    depth = np.linspace(1, 101, 5001).reshape(3, 1667)
+    assert depth_range(depth) == pytest.approx((3, 99))
+    unknown = np.vstack([depth, np.full((1, 1667), np.nan), np.zeros((1, 1667)), np.full((1, 1667), -5.0)])
+    assert depth_range(unknown) == pytest.approx((3, 99)), "unknown pixels count for nothing"
+    assert depth_range(depth[None, ..., None], near=10.0) == pytest.approx((10, 99))
+    assert depth_range(torch.from_numpy(depth)[None, None], far=50.0) == pytest.approx((3, 50))
+    assert depth_range(depth, 5, 6) == (5, 6)
+    assert depth_range(np.full((2, 3), np.nan)) == (1, 2)
+    assert depth_range(np.full((2, 3), 2.0)) == pytest.approx((2, 2.02))
+    assert depth_range(depth, near=200.0) == pytest.approx((200, 202))
+    assert depth_range(depth, far=0.5) == pytest.approx((0.5 / 1.01, 0.5))
+    for near, far, said in (
+        (2.0, 2.0, r"near \(--near\) must be less than far \(--far\); got 2 and 2"),
+        (3.0, 2.0, "got 3 and 2"),
+        (0.0, None, "near must be"),
+        (None, -1.0, "far must be"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            depth_range(depth, near, far)
+
+
+def test_the_ends_of_a_large_map_are_those_of_a_sample_of_its_known_pixels(monkeypatch):
+    monkeypatch.setattr(plotting, "MOST_FOR_RANGE", 100)
+    depth = np.random.default_rng(0).uniform(1, 9, (30, 30))
+    depth[1::3], depth[:, 1::3], depth[2::3], depth[:, 2::3] = 50, 50, 50, 50
+    near, far = depth_range(depth)  # every third row and column
+    assert 1 < near < 1.6 and 8.4 < far < 9
+    depth[::3, ::3] = np.nan
+    assert depth_range(depth) == pytest.approx((50, 50.5)), "all, if the sample has none"
+
+
+def test_a_range_of_ticks_uses_1_2_and_5_or_more_of_them():
+    assert ticks(1, 100) == [1, 2, 5, 10, 20, 50, 100]
+    assert ticks(0.9, 5.1) == [1, 1.5, 2, 3, 4, 5]
+    assert ticks(0.11, 0.9, 3) == pytest.approx([0.15, 0.3, 0.5])
+    assert ticks(10, 30) == [10, 15, 20, 25, 30] and ticks(10, 22) == [10, 12, 14, 16, 18, 20, 22]
+    assert ticks(2.0, 4.0, 4) == [2, 3, 4] and ticks(2.0, 2.5) == [2, 2.1, 2.2, 2.3, 2.4, 2.5]
+    wide = ticks(1e-3, 1e5)
+    assert 4 <= len(wide) <= 8 and wide[0] == 1e-3
+
+
+@pytest.mark.parametrize("height", [260, 700])
+def test_marks_of_a_legend_are_at_their_places_beside_the_bar(height):
+    """The black tick of each depth is where the bar has the colour of that depth in the map."""
+    depth = np.tile(np.geomspace(1, 16, 300), (height, 1))
+    figure = np.asarray(depth_figure(depth, near=1, far=16))
+    assert figure.shape[0] == height
+    letters = max(12, height // 26)
+    left, right = letters // 2, letters // 2 + max(14, height // 24)
+    assert figure.shape[1] == 300 + right + 5 * letters
+    bar = figure[:, 300 + (left + right) // 2]
+    top, bottom = 2 * letters, height - letters
+    line = max(1, letters // 12)
+    inside = slice(top + line, bottom - line)
+    rows = np.arange(height)[inside]
+    wanted = np.log(16) * (bottom - rows - 0.5) / (bottom - top) / np.log(16)
+    np.testing.assert_allclose(1 - place_in("plasma", bar[inside]), wanted, atol=0.02)
+    assert white(figure[: letters // 8, 300:]).all(), "the label leaves a margin"
+    assert white(bar[bottom + 1 :]).all() and not white(bar[top : bottom - 1]).any()
+    marks = (figure[:, 300 + right + 1] < 100).all(axis=-1)
+    dark = np.flatnonzero(marks & (np.arange(height) > 1.7 * letters))  # below the label
+    values = ticks(1, 16)
+    centres = [rows.mean() for rows in np.split(dark, np.flatnonzero(np.diff(dark) > 1) + 1)]
+    expected = [bottom - (bottom - top) * np.log(value) / np.log(16) for value in values][::-1]
+    np.testing.assert_allclose(centres, expected, atol=line + 1)
+
+
+def test_a_map_with_unknown_pixels_has_a_key_to_the_grey():
+    depth = np.tile(np.geomspace(1, 16, 300), (520, 1))
+    whole = np.asarray(depth_figure(depth))
+    depth[:9, :9] = np.nan
+    keyed = np.asarray(depth_figure(depth))
+    letters = 520 // 26
+    left, right = letters // 2, letters // 2 + max(14, 520 // 24)
+    box = keyed[520 - 2 * letters : 520 - letters, 300 + left : 300 + right]
+    assert (box[2:-2, 2:-2] == 128).all() and (box[0] == 0).all() and (box[:, -1] == 0).all()
+    assert (keyed[-letters:, 300 + left : 300 + right] == 255).all()
+    assert (whole[-letters + 1 :, 300 + left : 300 + right] == 255).all()
+    text = keyed[520 - 2 * letters : 520 - letters, 300 + right + letters // 2 :]
+    assert (text < 100).any() and (
+        keyed[:, 300 + left + 5][520 - 3 * letters + 1 : 520 - 2 * letters - 1] == 255
+    ).all()
+
+
+def test_the_label_says_the_unit():
+    depth = np.tile(np.geomspace(1, 16, 60), (260, 1))
+    metres, feet, none = (np.asarray(depth_figure(depth, unit=unit))[:22, 60:] for unit in ("m", "ft", None))
+    assert not np.array_equal(metres, feet) and not np.array_equal(metres, none)
+    np.testing.assert_array_equal(metres, np.asarray(depth_figure(depth))[:22, 60:])
+
+
+def test_a_figure_of_shares_has_its_colours_and_five_marks():
+    values = np.tile(np.linspace(0, 0.5, 300), (300, 1))
+    pixels = np.asarray(share_figure(values, "difference", 0.5))
+    np.testing.assert_array_equal(pixels[:, :300], colour_share(values, 0.5))
+    letters = 12
+    right = letters // 2 + max(14, 300 // 24)
+    marks = (pixels[:, 300 + right + 1] < 100).all(axis=-1)
+    dark = np.flatnonzero(marks & (np.arange(300) > 20))  # below the label
+    expected = [288 - share * (288 - 24) for share in (1, 0.75, 0.5, 0.25, 0)]
+    np.testing.assert_allclose(dark, expected, atol=1)
+    bar = pixels[30:280, 300 + letters // 2 + 6]
+    np.testing.assert_allclose(place_in("YlGnBu_r", bar), (288 - np.arange(30, 280) - 0.5) / 264, atol=0.02)
+    values[0, 0] = np.inf
+    assert (np.asarray(share_figure(values, "difference", 0.5))[:, 300:] == 128).all(axis=-1).sum() > 50
+
+
+def test_cells_of_a_grid_keep_their_shape_and_stand_in_rows():
+    """Each cell is at its place under its title; a row is as high as its highest."""
+    sizes = ((40, 30), (60, 20), (20, 40), (50, 50), (30, 60))
+    shades = (40, 80, 120, 160, 200)
+    pictures = [np.full((h, w), shade, np.uint8) for (w, h), shade in zip(sizes, shades, strict=True)]
+    for columns, shape in ((2, (2, 3)), (3, (3, 2)), (None, (4, 2))):
+        sheet = np.asarray(grid(pictures, list("abcde"), columns=columns, cell_width=80))
+        across, _ = shape
+        heights = [round(h * 80 / w) for w, h in sizes]
+        top = 6
+        for start in range(0, 5, across):
+            row = range(start, min(start + across, 5))
+            for k, number in enumerate(row):
+                x, y = 6 + k * 86, top + 24
+                cell = sheet[y : y + heights[number], x : x + 80]
+                assert (cell == shades[number]).all()
+                heading = sheet[top : top + 24, x : x + 80]
+                assert (
+                    not white(heading).all()
+                    and white(heading[:, :20]).all()
+                    and white(heading[:, -20:]).all()
+                )
+                assert white(sheet[y + heights[number], x : x + 80]).all()
+            top += 24 + 6 + max(heights[number] for number in row)
+        assert sheet.shape[:2] == (top, 6 + across * 86)
+    assert grid(pictures[:1], ["a"]).size == (6 + 326, 6 + 24 + 6 + 240)
+    with pytest.raises(TypeError):
+        grid(pictures[:1], ["a"], 2)  # settings are given by name
+
+
+def test_pictures_of_every_kind_are_rgb():
+    floats = np.array([[0.0, 0.5, np.nan], [1.0, 2.0, -1.0]])
+    levels = np.array([[0, 128, 0], [255, 255, 0]])
+    np.testing.assert_array_equal(np.asarray(plotting.as_picture(floats))[..., 1], levels)
+    np.testing.assert_array_equal(np.asarray(plotting.as_picture(floats > 0.4))[..., 0], 255 * (floats > 0.4))
+    colours = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
+    np.testing.assert_array_equal(np.asarray(plotting.as_picture(colours)), colours)
+    assert plotting.as_picture(Image.new("L", (3, 2), 7)).getpixel((1, 1)) == (7, 7, 7)
+    for bad in (np.zeros((2, 3), int), np.zeros((2, 3, 4), np.uint8), np.zeros(3), np.zeros((1, 2, 3, 3))):
+        with pytest.raises(ValueError, match="images must be PIL, or"):
+            plotting.as_picture(bad)
+
+
+def test_an_overview_has_the_left_image_beside_its_maps_in_one_scale(monkeypatch):
+    left = np.full((300, 400, 3), 0.25)
+    depth = shrunk(Image.new("RGB", (600, 300), (0, 255, 0)))
+    assert depth.size == (480, 240)
+    sure = Image.new("RGB", depth.size, (255, 0, 255))
+    error = np.full((300, 400), 0.02)
+    error[:, 200:] = 0.2
+    error[:50] = np.nan
+    cells = []
+    monkeypatch.setattr(
+        plotting, "grid", lambda images, titles, **options: cells.append((images, titles, options))
+    )
+    overview(left, depth, sure, error)
+    overview(left, depth, None, None)
+    (images, titles, options), (few, few_titles, _) = cells
+    assert titles == [
+        "left image",
+        "depth",
+        "confidence: within 10 % of the truth",
+        "photometric error (grey: not seen from the right)",
+    ]
+    assert few_titles == titles[:2] and options == {"columns": 2, "cell_width": 480}
+    beside = np.asarray(images[0])
+    assert beside.shape == (240, 480, 3) and (beside[:, :320] == 64).all() and white(beside[:, 320:]).all()
+    assert images[1] is depth and images[2] is sure and few[1] is depth
+    drawn = np.asarray(images[3])[:, :400]
+    np.testing.assert_array_equal(drawn, colour_share(error, 0.2))
+    for values, top in ((np.full((300, 400), 0.01), 0.05), (np.full((300, 400), np.nan), 0.05)):
+        overview(left, depth, None, values)
+        np.testing.assert_array_equal(np.asarray(cells[-1][0][2])[:, :400], colour_share(values, top))
+    spread = np.linspace(0, 1, 300 * 400).reshape(300, 400)
+    overview(left, depth, None, spread)
+    np.testing.assert_array_equal(
+        np.asarray(cells[-1][0][2])[:, :400], colour_share(spread, np.quantile(spread, 0.98))
+    )
+
+
+def test_large_maps_are_thinned_in_an_overview(monkeypatch):
+    monkeypatch.setattr(plotting, "CELL_WIDTH", 20)
+    cells = []
+    monkeypatch.setattr(plotting, "grid", lambda images, *_, **__: cells.append(images))
+    left = np.random.default_rng(0).random((260, 130, 3))
+    overview(left, Image.new("RGB", (100, 87)), None, left[..., 0])
+    third = left[::3, ::3, 0]
+    drawn = np.asarray(cells[0][2])[::3, : 3 * third.shape[1] : 3]  # enlarged by three for its legend
+    np.testing.assert_array_equal(drawn, colour_share(third, np.quantile(third, 0.98)))
+    thin = np.asarray(cells[0][0])
+    assert thin.shape == (87, 100, 3) and (thin[:, 44:] == 255).all()
+
+
+def test_all_frames_of_a_video_have_the_colours_of_one_range():
+    rng = np.random.default_rng(0)
+    depths = [rng.uniform(1 + n, 4 + n, (260, 40)) for n in range(3)]
+    depths[1][:5] = np.nan
+    near, far = depth_range(np.concatenate([depth.ravel() for depth in depths])[None])
+    frames = list(depth_frames(depths))
+    assert len(frames) == 3
+    for frame, depth in zip(frames, depths, strict=True):
+        np.testing.assert_array_equal(np.asarray(frame), np.asarray(depth_figure(depth, near, far)))
+    frames = list(depth_frames(depths, near=2.0, far=3.0, unit=None))
+    np.testing.assert_array_equal(np.asarray(frames[2]), np.asarray(depth_figure(depths[2], 2.0, 3.0, None)))
+    for bad in ([], [np.ones((2, 3)), np.ones((3, 2))]):
+        with pytest.raises(ValueError, match="depths_m must be at least one map, all of one shape"):
+            depth_frames(bad)
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "webp", "gif"])
+def test_a_video_has_its_frames_in_order_at_their_rate(suffix, tmp_path):
+    path = tmp_path / f"v.{suffix}"
+    shades = [30, 90, 150, 210]
+    write_depth_video(path, (Image.new("RGB", (65, 49), (shade, 20, 20)) for shade in shades), fps=8.0)
+    if suffix == "mp4":
+        capture = cv2.VideoCapture(str(path))
+        assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(8)
+        got = [capture.read()[1] for _ in shades]
+        assert not capture.grab() and got[0].shape == (48, 64, 3), "of even sides"
+        found = [round(float(image[..., 2].mean())) for image in got]
+    else:
+        with Image.open(path) as image:
+            assert image.n_frames == 4 and image.size == (65, 49) and image.info["loop"] == 0
+            found = []
+            for number in range(4):
+                image.seek(number)
+                image.load()
+                assert image.info["duration"] in (125, 120)
+                found.append(image.convert("RGB").getpixel((9, 9))[0])
+    np.testing.assert_allclose(found, shades, atol=12)
+
+
+def test_what_is_no_video_is_refused(tmp_path):
+    for name, fps, said in (
+        ("v.avi", 10, "the video must be a file that ends in .mp4, .webp, .gif; got v.avi"),
+        ("v.MP4", 0.09, "fps must be between 0.1 and 120"),
+        ("v.gif", 120.1, "fps must be between 0.1 and 120"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            check_video(tmp_path / name, fps)
+    for fps in (0.1, 120):
+        check_video("v.WEBP", fps)
+    with pytest.raises(ValueError, match="frames must be at least one picture; got none"):
+        write_depth_video(tmp_path / "v.gif", [])
+    with pytest.raises(InputError, match=r"in an existing folder"):
+        write_depth_video(tmp_path / "none" / "v.gif", [Image.new("RGB", (4, 4))])
+
+    def broken():
+        yield Image.new("RGB", (40, 40))
+        raise OSError(28, "No space left on device")
+
+    for name in ("v.gif", "v.mp4"):
+        with pytest.raises(InputError, match=rf"got {tmp_path / name} \(No space left on device\)"):
+            write_depth_video(tmp_path / name, broken())
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from geodiff_plugin.pose import fit as fit_module
 from geodiff_plugin.pose import refine
 from geodiff_plugin.pose import tracks as tracks_module
 from geodiff_plugin.pose.lens import remaining_distortion, undistorted_rays
-from geodiff_plugin.pose.mistakes import _undone, exchangeable, find_mistake
+from geodiff_plugin.pose.mistakes import exchangeable, find_mistake
 from geodiff_plugin.pose.moving import moved_share
 from geodiff_plugin.pose.refine import depths_apart, fit_displacement, straightened
 from geodiff_plugin.pose.solve import PosePrior, regularised_poses, solve_poses
@@ -31,10 +31,8 @@ from geodiff_plugin.pose.tracks import (
     Tracks,
     _dense_matches,
     behind_infinity,
-    epipolar,
     grey_image,
     median_residuals,
-    project_tracks,
     residuals_px,
     solve_inverse_depth,
     sparse_tracks,
@@ -87,33 +85,6 @@ TRUE = pose((1.0, -6.0, 2.0), (0.3, 0.05, -0.08))
 
 def depth_error(tracks: Tracks, Ts: np.ndarray, depth_m: np.ndarray) -> float:
     return float(np.median(np.abs(solve_inverse_depth(tracks, Ts) * depth_m - 1)))
-
-
-def test_residual_is_the_distance_from_the_epipolar_line() -> None:
-    tracks, Ts, _ = make_tracks([TRUE], noise_px=1.0, outliers=0.0)
-    R, t = Ts[0, :3, :3], Ts[0, :3, 3]
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    F = np.linalg.inv(K).T @ cross @ R @ np.linalg.inv(K)
-    lines = np.c_[tracks.left_px, np.ones(len(tracks))] @ F.T
-    places = np.c_[tracks.right_px[0], np.ones(len(tracks))]
-    distance = np.abs((lines * places).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
-    assert np.allclose(residuals_px(tracks, Ts)[0], distance, atol=1e-9)
-
-
-def test_with_one_right_view_a_track_lies_where_its_line_is_nearest_to_the_match() -> None:
-    tracks, Ts, depth_m = make_tracks([TRUE], noise_px=1.0, outliers=0.0, count=60)
-    skewed = tracks.K_rights + [[0.0, 3.0, 0.0], [0.0, -20.0, 0.0], [0.0, 0.0, 0.0]]
-    tracks = replace(tracks, K_rights=skewed, right_px=tracks.right_px + [1.0, -4.0])
-    at = epipolar(tracks, Ts[0])
-    nearest = tracks.right_px[0] + at.off_px[:, None] * at.normals
-    for i, (ray, match) in enumerate(zip(tracks.rays, tracks.right_px[0], strict=True)):
-
-        def away_px(w: float, ray: np.ndarray = ray, match: np.ndarray = match) -> np.ndarray:
-            return project_tracks(ray[None], np.array([w]), skewed[0], Ts[0]).px[0] - match
-
-        found = least_squares(lambda w: away_px(w[0]), 1.0 / depth_m[i], x_scale=0.01, xtol=1e-14)
-        assert solve_inverse_depth(tracks, Ts)[i] == pytest.approx(found.x[0], abs=1e-6)
-        assert nearest[i] - match == pytest.approx(away_px(found.x[0]), abs=1e-4)
 
 
 def test_a_perturbed_pose_comes_back_but_for_what_the_views_cannot_tell() -> None:
@@ -232,17 +203,6 @@ def test_a_mistake_is_named(true, given, K_given, words: str) -> None:
     T = np.linalg.inv(given)
     found = find_mistake(replace(tracks, K_left=K_given, K_rights=K_given[None]), T, T)
     assert found is not None and re.search(words, found)
-
-
-def test_k_of_another_size_keeps_the_corner_of_the_first_pixel() -> None:
-    """As the cure says, with the centre of that pixel at 0: each ray goes to ``(u + 0.5) * s - 0.5``."""
-    tracks, Ts, _ = make_tracks([TRUE], count=10)
-    undone = list(_undone(tracks, Ts[0]))
-    scaled = [each.tracks.K_left for each in undone if each.mistake.code == "camera.scaled"]
-    assert len(scaled) >= 6
-    for K_scaled in scaled:
-        factor, rays = K_scaled[0, 0] / K[0, 0], tracks.rays @ K_scaled.T
-        np.testing.assert_allclose(rays[:, :2], (tracks.left_px + 0.5) * factor - 0.5)
 
 
 @pytest.mark.parametrize(
@@ -785,39 +745,6 @@ def test_the_rows_of_a_rig_that_has_drifted_agree_again(seed: int) -> None:
     assert report.status == "refined"
     assert report.residual_px[0] < 0.3 < 0.45 < report.residual_px_given[0]
     assert np.linalg.norm(report.E[0][:3, 3]) == pytest.approx(float(rig.E[0, 3]), rel=0.03)
-
-
-def test_a_calibrated_rig_keeps_its_calibration_where_all_matches_fit_it(monkeypatch) -> None:
-    """The sparse matches alone miss it by chance; no millimetre of vertical baseline is made of that."""
-    rig = render_pair(3, size=(240, 320))
-    T = torch.from_numpy(np.linalg.inv(rig.E.numpy())).float()
-    views = (CameraView(rig.right.image_01.float(), rig.K_right.float(), T),)
-    given = PosedViews(rig.left.image_01.float(), views, rig.K_left.float())
-    sparse_tracks = fit_module.sparse_tracks
-
-    def missing(*images):
-        sparse = sparse_tracks(*images)
-        return replace(sparse, right_px=sparse.right_px + np.array([0.0, 0.6]))
-
-    monkeypatch.setattr(fit_module, "sparse_tracks", missing)
-    used, report = checked_views(given)
-    assert report.status == "fits" and used[0] is views[0]
-    assert report.residual_px_given[0] < fit_module.FITS_PX and not report.warnings
-
-
-def test_a_rig_is_not_told_that_another_pose_fits_as_well(monkeypatch) -> None:
-    """Its calibration determines the pose; poses of a tracker do not, and forbid trust then."""
-    monkeypatch.setattr(refine, "MOST_DEPTH_SPREAD", 0.0)  # however little the depths of the two differ
-    rig = render_pair(3, size=(240, 320))
-    for turn_deg, told in ((0.0, False), (0.7, True)):
-        E = rig.E.numpy() @ pose((turn_deg, 0.0, 0.0), (0, 0, 0))
-        right = torch.roll(rig.right.image_01.float(), 2, 1)  # two pixels down, so that neither pose fits
-        T = torch.from_numpy(np.linalg.inv(E)).float()
-        views = (CameraView(right, rig.K_right.float(), T),)
-        _, report = checked_views(PosedViews(rig.left.image_01.float(), views, rig.K_left.float()))
-        messages = [m for m in report.warnings if m.code == "pose.undetermined"]
-        assert bool(messages) == told and all(m.forbids_trust for m in messages), report
-        assert (report.depth_spread > 0.0) is told
 
 
 def test_a_dense_match_holds_where_the_flow_from_its_place_leads_back(monkeypatch) -> None:

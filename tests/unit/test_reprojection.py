@@ -6,8 +6,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin import InputError, MetricDepthOutput
-from geodiff_plugin._reprojection import PosedCamera, depth_in_camera
+from geodiff_plugin import InputError, MetricDepthOutput, _strips
+from geodiff_plugin._reprojection import PosedCamera, _samples_a_side, depth_in_camera
 
 K = np.array([[120.0, 0.5, 79.0], [0, 125.0, 58.0], [0, 0, 1]])
 SIZE = (160, 120)
@@ -116,3 +116,123 @@ def test_a_camera_that_is_none_gets_a_sentence(camera, words):
     output = MetricDepthOutput(prediction=np.ones((1, 4, 4, 1), np.float32), K=K[None])
     with pytest.raises(InputError, match=words):
         output.into(*camera)
+
+
+#: Two cameras whose pixels are not square, in different directions, and further poses between them.
+OBLIQUE = PosedCamera(
+    np.array([[150.0, 1.5, 70.0], [0, 110.0, 66.0], [0, 0, 1]]),
+    pose(6, -9, 15, at=(0.25, -0.1, 0.2)),
+    (150, 130),
+)
+
+
+@pytest.mark.parametrize("unit", [0.05, 1000.0])
+def test_depth_in_another_unit_is_the_same_depth(unit):
+    """Also of scenes that are nearer than 1."""
+    depth, E = cast(K, np.eye(4), SIZE)[0], OBLIQUE.E.copy()
+    E[:3, 3] *= unit
+    found = depth_in_camera(depth * unit, K, OBLIQUE._replace(E=E))
+    expected = depth_in_camera(depth, K, OBLIQUE)
+    assert (expected > 0).mean() > 0.5
+    np.testing.assert_allclose(found, unit * expected, rtol=1e-5)
+
+
+def test_strips_of_any_height_give_the_same_depth(monkeypatch):
+    depth = cast(K, np.eye(4), SIZE)[0]
+    expected = depth_in_camera(depth, K, OBLIQUE)
+    for pixels in (1000, 3333):
+        monkeypatch.setattr(_strips, "STRIP_PIXELS", pixels)
+        found = depth_in_camera(depth, K, OBLIQUE)
+        off = np.abs(found - expected) / np.maximum(expected, 1)
+        assert (off > 0).mean() < 0.02 and (off > 0.05).mean() < 1e-3  # a strip has its own number of samples
+
+
+def test_a_camera_at_the_same_place_sees_the_same_pixels_elsewhere():
+    """Moved by whole pixels, by a principal point of its own; each axis by another number."""
+    depth = cast(K, np.eye(4), SIZE)[0].astype(np.float32)
+    same = depth_in_camera(depth, K, PosedCamera(K, np.eye(4), SIZE))
+    np.testing.assert_allclose(same, depth, rtol=2e-3)
+    assert (np.abs(same / depth - 1) < 1e-6).mean() > 0.99
+    moved = K.copy()
+    moved[:2, 2] += -7, 5
+    found = depth_in_camera(depth, K, PosedCamera(moved, np.eye(4), (140, 130)))
+    np.testing.assert_allclose(found[5:125, :140], depth[:, 7:147], rtol=2e-3)
+    assert not found[:5].any() and not found[125:].any()
+
+
+def test_depth_comes_back_from_another_camera():
+    depth = cast(K, np.eye(4), SIZE)[0]
+    there = depth_in_camera(depth, K, OBLIQUE)
+    back = depth_in_camera(there, OBLIQUE.K, PosedCamera(K, np.linalg.inv(OBLIQUE.E), SIZE))
+    both = back > 0
+    assert both.mean() > 0.5
+    off = np.abs(back / depth - 1)[both]
+    assert np.median(off) < 1e-5 and (off < 2e-3).mean() > 0.97
+
+
+def test_a_depth_is_within_a_twentieth_of_the_nearest_point_in_its_pixel():
+    """At the edge of the screen a pixel shows the screen, though the ray of its centre may miss it."""
+    depth = cast(K, np.eye(4), SIZE)[0]
+    found = depth_in_camera(depth, K, OBLIQUE)
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]]
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
+    points = (rays * depth[..., None] - OBLIQUE.E[:3, 3]) @ OBLIQUE.E[:3, :3]
+    pixels = points @ OBLIQUE.K.T
+    at = np.rint(pixels[..., :2] / pixels[..., 2:]).astype(int)
+    width, height = OBLIQUE.size
+    inside = ((at >= 0) & (at < [width, height])).all(-1)
+    nearest = np.full((height, width), np.inf)
+    np.minimum.at(nearest, (at[inside][:, 1], at[inside][:, 0]), points[inside][:, 2])
+    hit = np.isfinite(nearest)
+    assert hit.mean() > 0.3 and (found[hit] > 0).all() and (found[hit] <= 1.05 * nearest[hit] + 1e-5).all()
+
+
+@pytest.mark.parametrize("ratio", [1.07, 1.09])
+def test_a_step_in_depth_of_more_than_8_percent_is_no_surface(ratio):
+    """A camera five times as fine sees the step as a slope or as a gap."""
+    depth = np.full((12, 16), 2.0)
+    depth[:, 8:] *= ratio
+    small = np.array([[30.0, 0, 7.0], [0, 30.0, 5.5], [0, 0, 1]])
+    found = depth_in_camera(depth, small, PosedCamera(np.diag([5.0, 5.0, 1]) @ small, np.eye(4), (75, 55)))
+    between = found[5:50, 36:40]  # columns 7.2 to 7.8 of the first camera
+    assert ((between > 2.001) & (between < 2 * ratio - 0.001)).all() if ratio < 1.08 else (between == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("finer", "roll", "count"),
+    [
+        ((0.5, 0.5), 0, 1),
+        ((0.69, 0.6), 0, 1),
+        ((0.6, 0.75), 0, 2),
+        ((3.4, 1.0), 0, 5),
+        ((1.0, 1.0), 45, 3),
+        ((9.0, 2.0), 0, 8),
+    ],
+)
+def test_a_cell_has_so_many_samples_that_a_finer_camera_sees_no_hole(finer, roll, count):
+    """A sample every 0.7 pixels of the finer axis at most, but eight a side."""
+    square = np.array([[80.0, 0, 20.0], [0, 80.0, 15.0], [0, 0, 1]])
+    camera = PosedCamera(np.diag([*finer, 1]) @ square, pose(0, 0, roll), (400, 300))
+    x, y = np.arange(5.0, 15.0), np.arange(4.0, 14.0)
+    corners = [np.full(10, 0.5)] * 4
+    assert _samples_a_side(x, y, corners, square, camera) == count
+    if finer[0] < 8:
+        return
+    found = depth_in_camera(
+        np.full((30, 40), 2.0), square, camera._replace(K=np.diag([7.8, 7.8, 1]) @ square, size=(312, 234))
+    )
+    assert (found[:226, :304] > 0).all()
+
+
+def test_surfaces_next_to_or_behind_the_other_camera_are_not_seen():
+    """The camera stands in the middle of a slanted plane that it looks along."""
+    wide = np.array([[30.0, 0, 40.0], [0, 30.0, 30.0], [0, 0, 1]])
+    v, u = np.mgrid[:60, :80]
+    depth = 2.0 + 0.02 * u
+    camera = PosedCamera(wide, pose(0, 90, 0, at=(0.3, 0.2, 2.5)), (80, 60))
+    found = depth_in_camera(depth, wide, camera)
+    points = np.stack([(u - 40) / 30 * depth, (v - 30) / 30 * depth, depth], -1).reshape(-1, 3)
+    seen = (points - camera.E[:3, 3]) @ camera.E[:3, :3]
+    ahead = seen[seen[:, 2] > 0]
+    assert 0 < len(ahead) < len(points) and np.isfinite(found).all() and (found >= 0).all()
+    assert found.max() <= ahead[:, 2].max() * 1.05

@@ -1,0 +1,606 @@
+"""What a capture writes, read back by COLMAP, trimesh and NumPy, from cameras of different sizes."""
+
+import json
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from geodiff_plugin import Capture, plotting
+from geodiff_plugin._checks import InputFileError
+from geodiff_plugin.capture import results
+from geodiff_plugin.capture.agreement import agreed
+from geodiff_plugin.capture.frames import choose_neighbours
+from geodiff_plugin.capture.results import FinishedFrame, fuse, kept, normals_of, write_map, write_mesh
+from geodiff_plugin.formats.clouds import flying_points
+from geodiff_plugin.pose.multiview import SolvedCapture
+from geodiff_plugin.types import DepthFrame
+from tests.unit.capture.cameras import ES, KS, NAMES, SIZES, depth_of, frame_of, image_of, write_capture
+from tests.unit.capture_room import HALF, render
+
+K = np.array([[31.0, 0.0, 9.3], [0.0, 26.0, 12.1], [0.0, 0.0, 1.0]])
+
+
+def test_normals_of_a_plane_are_its_own_towards_the_camera():
+    v, u = np.mgrid[:22, :17]
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
+    for normal in ([0.3, -0.2, -1.0], [-0.5, 0.4, -0.8], [0.1, 0.7, -0.6]):
+        unit = np.array(normal) / np.linalg.norm(normal)
+        found = normals_of((-2.5 * np.linalg.norm(normal) / (rays @ normal)).astype(np.float64), K)
+        assert found.dtype == np.float32 and found.shape == (22, 17, 3)
+        np.testing.assert_allclose(found, np.broadcast_to(unit, found.shape), atol=1e-5)
+
+
+def test_kept_pixels_are_sure_or_confirmed_and_never_contradicted_nor_flying():
+    confidence = np.repeat(np.float32([0.49, 0.5, 0.9]), 4).reshape(3, 4)
+    confirmed, observers = np.uint8([[0, 0, 1, 3]] * 3), np.uint8([[0, 2, 1, 3]] * 3)
+    frame = DepthFrame("", np.ones((3, 4), np.float32), confidence, K, np.eye(4))
+    sure = confidence >= 0.5
+    np.testing.assert_array_equal(kept(frame), sure)
+    np.testing.assert_array_equal(kept(replace(frame, confirmed=confirmed)), sure)
+    agreed_on = np.array([True, False, True, True])
+    np.testing.assert_array_equal(
+        kept(replace(frame, confirmed=confirmed, observers=observers)), sure & agreed_on
+    )
+    spike = np.ones((7, 9), np.float32)
+    spike[3, 4] = 0.5
+    found = kept(DepthFrame("", spike, np.ones_like(spike), K, np.eye(4)))
+    np.testing.assert_array_equal(found, spike == 1)
+
+
+def doubted(number: int) -> DepthFrame:
+    """A frame of which some pixels are unsure, contradicted or flying."""
+    rng, frame = np.random.default_rng(number), frame_of(number)
+    shape = frame.depth.shape
+    frame.depth[rng.random(shape) < 0.02] *= 0.5
+    confidence = rng.uniform(0.3, 1, shape).astype(np.float32)
+    confirmed, observers = (rng.integers(0, 3, shape).astype(np.uint8) for _ in range(2))
+    return replace(
+        frame, confidence=confidence, confirmed=confirmed, observers=np.maximum(observers, confirmed)
+    )
+
+
+def mean_by_cell(rows: list[np.ndarray], cell: float) -> dict[tuple[int, ...], np.ndarray]:
+    groups = {}
+    for row in rows:
+        groups.setdefault(tuple(np.floor(row[:3] / cell).astype(int)), []).append(row)
+    return {at: np.mean(group, 0) for at, group in groups.items()}
+
+
+def expected_cloud(frames: list[DepthFrame], every: list[int], factor: float) -> list[np.ndarray]:
+    """Mean position, normal and colour of each cell, over the means of each frame."""
+    cell = factor * np.median([np.median(frame.depth) for frame in frames])
+    means = []
+    for frame, step in zip(frames, every, strict=True):
+        image, rows = image_of(NAMES.index(frame.name)), []
+        normals = normals_of(frame.depth, frame.K)
+        good = (frame.confidence >= 0.5) & ~flying_points(frame.depth)
+        good &= (frame.confirmed > 0) | (frame.observers == 0)
+        for v, u in np.argwhere(good)[::step]:
+            point = frame.E @ [*np.linalg.solve(frame.K, [u, v, 1]) * frame.depth[v, u], 1]
+            normal = np.linalg.solve(frame.E[:3, :3].T, normals[v, u])
+            rows.append(np.r_[point[:3], normal, 255 * image[v, u]])
+        means += mean_by_cell(rows, cell).values()
+    return list(mean_by_cell(means, cell).values())
+
+
+def in_order(rows: np.ndarray) -> np.ndarray:
+    return rows[np.lexsort(np.round(rows[:, :3], 6).T)]
+
+
+@pytest.mark.parametrize(("most", "names"), [(200_000, ["d", "a"]), (150, NAMES)])
+def test_a_fused_cloud_has_the_mean_of_every_cell(most, names, monkeypatch):
+    """Also of every so many points of a frame, where it has more than a bound."""
+    monkeypatch.setattr(results, "CELL_SHARE", 0.03)
+    monkeypatch.setattr(results, "MOST_POINTS", most)
+    frames = {name: doubted(NAMES.index(name)) for name in names}
+    counts = [int(kept(frame).sum()) for frame in frames.values()]
+    every = [max(1, count // most) for count in counts]
+    assert (most > 1000) == (max(every) == 1)
+    cloud, normals = fuse(names, frames.__getitem__, lambda name: image_of(NAMES.index(name)))
+    expected = in_order(np.array(expected_cloud(list(frames.values()), every, 0.03)))
+    found = in_order(np.hstack([cloud.points_m, normals, cloud.colours]))
+    assert len(found) == len(expected) and cloud.colours.dtype == np.uint8
+    np.testing.assert_allclose(found[:, :3], expected[:, :3], atol=1e-6)
+    directions = expected[:, 3:6] / np.linalg.norm(expected[:, 3:6], axis=1, keepdims=True)
+    np.testing.assert_allclose(found[:, 3:6], directions, atol=1e-5)
+    assert np.abs(found[:, 6:] - expected[:, 6:]).max() < 0.51
+
+
+def test_a_cloud_of_the_room_lies_on_its_walls_with_their_normals_and_paint(monkeypatch):
+    """However often the points of frames are merged, and in any unit."""
+    frames = {name: frame_of(number, confidence=0.9) for number, name in enumerate(NAMES)}
+    counts = []
+    for merged_after, factor in ((20, 1.0), (1, 1.0), (3, 1.0), (20, 16.0)):
+        monkeypatch.setattr(results, "MERGED_AFTER", merged_after)
+        longer = np.array([[1, 1, 1, factor]] * 3 + [[1] * 4])
+        scaled = {
+            n: replace(f, depth=f.depth * np.float32(factor), E=f.E * longer) for n, f in frames.items()
+        }
+        cloud, normals = fuse(NAMES, scaled.__getitem__, lambda name: image_of(NAMES.index(name)))
+        points = cloud.points_m / factor
+        off = np.abs(np.abs(points) - HALF)
+        wall = off.argmin(1)
+        assert np.median(off.min(1)) < 1e-3 and len(np.unique(wall)) == 3
+        inwards = -np.sign(np.take_along_axis(points, wall[:, None], 1)[:, 0])
+        right = inwards * np.take_along_axis(normals, wall[:, None], 1)[:, 0]
+        assert (right > 0.99).mean() > 0.9
+        counts.append(len(points))
+    kept_pixels = sum(int(kept(frame).sum()) for frame in frames.values())
+    assert 0.5 * kept_pixels < counts[0] <= kept_pixels
+    assert max(counts) - min(counts) < 0.03 * counts[0]
+
+
+def test_points_closer_than_a_cell_are_one_in_every_direction_and_on_either_side_of_0():
+    """0.4 % of the median of the frames' median depths, here of 1 m."""
+    rng = np.random.default_rng(0)
+    rows = rng.uniform((-1, -3, 0), (1, 1, 9), (3000, 3))
+    found = results._thinned(np.hstack([rows, rows**2]), 0.5)
+    expected = np.array(list(mean_by_cell(np.hstack([rows, rows**2]), 0.5).values()))
+    np.testing.assert_allclose(in_order(found), in_order(expected), rtol=1e-9)
+    assert results._thinned(rows[:0], 0.5).shape == (0, 3)
+    depth = np.full((9, 11), 1.0, np.float32)
+    sizes = []
+    for nearness in (1.0, 4.0):
+        camera = np.diag(
+            [260 * nearness, 260 * nearness, 1.0]
+        )  # neighbouring pixels are 3.8 or 0.96 mm apart
+        frame = DepthFrame("a", depth, np.ones_like(depth), camera, np.eye(4))
+        cloud, _ = fuse(["a"], lambda name, frame=frame: frame, lambda name: np.ones((9, 11, 3)))
+        sizes.append(cloud.points_m[:, :2].max(0) // 0.004 + 1)
+        assert len(cloud.points_m) == len(np.unique(np.floor(cloud.points_m[:, :2] / 0.004), axis=0))
+    assert (sizes[0] >= [10, 8]).all() and (sizes[1] <= [3, 3]).all()
+
+
+def observed_points(count: int) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
+    """Points of the frames' surfaces, and the pixels at which each frame sees some, with their rows."""
+    rng, points, seen = np.random.default_rng(0), [], [[] for _ in NAMES]
+    for row, number in enumerate(rng.integers(0, 4, count)):
+        height, width = depth_of(number).shape
+        u, v = rng.integers(0, width), rng.integers(0, height)
+        point = ES[number] @ [*np.linalg.solve(KS[number], [u, v, 1]) * depth_of(number)[v, u], 1]
+        points.append(point[:3])
+        for other in range(4):
+            x, y, z = KS[other] @ np.linalg.solve(ES[other], point)[:3]
+            if z > 0 and 0 <= x / z <= SIZES[other][0] - 1 and 0 <= y / z <= SIZES[other][1] - 1:
+                seen[other].append((row, x / z, y / z))
+    observations = [(np.array(each)[:, 1:], np.array(each)[:, 0].astype(int)) for each in seen]
+    observations[2][0][:2] = [
+        [-0.5, -0.5],
+        [SIZES[2][0] - 0.5, SIZES[2][1] - 0.5],
+    ]  # outer corners of the image
+    return np.array(points), observations
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    """Frames, points, observations and the folder that is written of them."""
+    frames = [doubted(number) for number in range(4)]
+    points, seen = observed_points(60)
+    results.write_workspace(tmp_path, iter(frames), lambda name: image_of(NAMES.index(name)), points, seen)
+    return frames, points, seen, tmp_path
+
+
+def test_cameras_of_a_workspace_are_read_by_colmap(workspace):
+    model = pytest.importorskip("pycolmap").Reconstruction(str(workspace[-1] / "sparse"))
+    images = {image.name: image for image in model.images.values()}
+    assert sorted(images) == [f"{name}.png" for name in NAMES]
+    for name, size, K_true, E in zip(NAMES, SIZES, KS, ES, strict=True):
+        found = images[f"{name}.png"]
+        camera = model.cameras[found.camera_id]
+        assert (camera.width, camera.height) == size
+        np.testing.assert_allclose(camera.params, [*K_true.diagonal()[:2], *K_true[:2, 2] + 0.5], rtol=1e-7)
+        pose = found.cam_from_world() if callable(found.cam_from_world) else found.cam_from_world
+        np.testing.assert_allclose(pose.matrix(), np.linalg.inv(E)[:3], atol=1e-9)
+
+
+def test_points_that_two_frames_of_a_workspace_see_have_their_tracks_and_colours(workspace):
+    """Points that only one frame sees are left out. The others keep their order."""
+    _, points, seen, folder = workspace
+    model = pytest.importorskip("pycolmap").Reconstruction(str(folder / "sparse"))
+    shared = np.flatnonzero(np.bincount(np.concatenate([rows for _, rows in seen]), minlength=60) > 1)
+    assert 10 < len(shared) < 55
+    found = [model.points3D[number] for number in sorted(model.points3D)]
+    np.testing.assert_allclose([point.xyz for point in found], points[shared], atol=1e-5)
+    colours = {}
+    for number, (px, rows) in enumerate(seen):
+        (image,) = (image for image in model.images.values() if image.name == f"{NAMES[number]}.png")
+        noticed = np.isin(rows, shared)
+        observed = [point for point in image.points2D if point.has_point3D()]
+        np.testing.assert_allclose([point.xy for point in observed], px[noticed] + 0.5, atol=1e-3)
+        places = [model.points3D[point.point3D_id].xyz for point in observed]
+        np.testing.assert_allclose(places, points[rows[noticed]], atol=1e-5)
+        last = np.array(SIZES[number][::-1]) - 1
+        for (x, y), row in zip(px, rows, strict=True):
+            colours[row] = 255 * image_of(number)[tuple(np.clip([round(y), round(x)], 0, last))]
+    for point, row in zip(found, shared, strict=True):
+        assert np.abs(point.color - colours[row]).max() < 0.51
+        images = [element.image_id for element in point.track.elements]
+        assert len(set(images)) == len(images) == sum(row in rows for _, rows in seen)
+
+
+def test_maps_and_lists_of_a_workspace_are_those_of_its_frames(workspace):
+    frames, _, _, folder = workspace
+    for number, (name, frame) in enumerate(zip(NAMES, frames, strict=True)):
+        with Image.open(folder / "images" / f"{name}.png") as picture:
+            np.testing.assert_array_equal(picture, np.rint(255 * image_of(number)))
+        depth, normals = (
+            folder / f"stereo/{kind}_maps/{name}.png.geometric.bin" for kind in ("depth", "normal")
+        )
+        np.testing.assert_array_equal(read_colmap_map(depth), np.where(kept(frame), frame.depth, 0))
+        np.testing.assert_array_equal(read_colmap_map(normals), normals_of(frame.depth, frame.K))
+    assert (folder / "stereo/fusion.cfg").read_text().split() == [f"{name}.png" for name in NAMES]
+    lines = (folder / "stereo/patch-match.cfg").read_text().splitlines()
+    assert lines == [line for name in NAMES for line in (f"{name}.png", "__auto__, 20")]
+    assert (folder / "stereo/consistency_graphs").is_dir()
+
+
+def read_colmap_map(path) -> np.ndarray:
+    """As ``scripts/python/read_write_dense.py`` of COLMAP."""
+    content = path.read_bytes()
+    width, height, channels, data = content.split(b"&", 3)
+    shape = int(width), int(height), int(channels)
+    values = np.frombuffer(data, np.float32).reshape(shape, order="F")
+    return np.transpose(values, (1, 0, 2)).squeeze()
+
+
+def test_maps_are_read_by_the_script_of_colmap(tmp_path):
+    values = np.random.default_rng(0).normal(size=(5, 7, 3))
+    write_map(tmp_path / "map.bin", values)
+    np.testing.assert_array_equal(read_colmap_map(tmp_path / "map.bin"), values.astype(np.float32))
+
+
+@pytest.fixture
+def finished(tmp_path) -> Capture:
+    """A capture whose frames have depth by their own runs in ``out``, each with errors of its own."""
+    capture = Capture.open(write_capture(tmp_path / "scan"))
+    off = np.diag([1.02, 0.97, 1.0]), np.diag([1.0, 1.0, 1.0, 1.0]) + np.eye(4, k=3) * 0.1
+    capture.frames = [replace(f, K=off[0] @ f.K, E=off[1] @ f.E) for f in capture.frames]  # before the solve
+    points = np.random.default_rng(3).uniform((-1, -1, 1.5), (1.5, 1, 2.6), (60, 3))
+    rows = [np.arange(0, 45), np.arange(10, 60), np.arange(20, 60), np.arange(5, 40)]
+    seen = tuple((np.full((len(each), 2), 7.0), each) for each in rows)
+    capture.solved = SolvedCapture("given", ES, ES, KS, np.ones(4, bool), points, seen)
+    for number, name in enumerate(NAMES):
+        rng = np.random.default_rng(number)
+        depth = depth_of(number) * rng.normal(1, 0.01, depth_of(number).shape)
+        depth[5:12, 6:15] *= 0.6 + 0.3 * number
+        confidence = rng.uniform(0, 1, depth.shape)
+        confidence[:3] = 0
+        (tmp_path / "out" / name).mkdir(parents=True)
+        results.save_alone(tmp_path / "out" / name, depth, confidence)
+    return capture
+
+
+@pytest.fixture
+def plain_figures(monkeypatch):
+    """Figures of depth take most of the time of a run. Other tests look at them."""
+    monkeypatch.setattr(plotting, "depth_figure", lambda depth, **_: Image.new("RGB", (8, 6)))
+
+
+def alone(out, number: int) -> DepthFrame:
+    depth, confidence = (
+        np.load(out / NAMES[number] / f"{kind}_alone.npy") for kind in ("depth", "confidence")
+    )
+    return DepthFrame(NAMES[number], depth, confidence, KS[number], ES[number])
+
+
+def test_agreement_of_finished_frames_is_written_and_its_shares_are_of_what_was_written(finished, tmp_path):
+    """Only frames of the run take part."""
+    out, run = tmp_path / "out", ["d", "a", "c"]
+    shares = results.write_agreement(finished, out, run)
+    assert list(shares) == run
+    for name in run:
+        number = NAMES.index(name)
+        near = choose_neighbours(finished.solved, number, 9, [NAMES.index(other) for other in run])
+        expected = agreed(alone(out, number), [alone(out, other) for other in near])
+        maps = [np.load(out / name / f"{kind}.npy") for kind in ("depth", "confidence", "confirmed", "asked")]
+        for found, values in zip(
+            maps, (expected.depth, expected.confidence, expected.confirmed, expected.observers), strict=True
+        ):
+            np.testing.assert_array_equal(found, values)
+        _, _, confirmed, asked = maps
+        assert shares[name]["checked_against"] == len(near) == 2
+        assert shares[name]["confirmed"] == pytest.approx(np.mean(confirmed > 0), abs=6e-5)
+        assert shares[name]["unconfirmed"] == pytest.approx(np.mean((asked > 0) & (confirmed == 0)), abs=6e-5)
+        assert all(round(share, 4) == share for share in shares[name].values())
+        assert 0.001 < shares[name]["unconfirmed"] < shares[name]["confirmed"] < 0.95
+        whole = np.asarray(Image.open(out / name / "depth_mm.png"))
+        np.testing.assert_array_equal(whole == 0, maps[1] == 0)
+        assert np.abs(whole - 1000.0 * maps[0])[whole > 0].max() < 0.51 and (whole == 0).any()
+        drawn = plotting.depth_figure(maps[0], unit="m")
+        np.testing.assert_array_equal(np.asarray(Image.open(out / name / "depth.png")), np.asarray(drawn))
+    assert not (out / "b" / "depth.npy").exists()
+
+
+def test_a_frame_is_checked_against_six_others_at_most(finished, tmp_path, monkeypatch):
+    counts = []
+    monkeypatch.setattr(
+        results,
+        "choose_neighbours",
+        lambda solved, frame, most, among: counts.append((frame, most, among)) or [],
+    )
+    assert results.write_agreement(finished, tmp_path / "out", ["b", "c"])["c"]["checked_against"] == 0
+    assert counts == [(1, 6, {1, 2}), (2, 6, {1, 2})]
+
+
+def test_depth_without_a_confidence_is_half_sure(tmp_path):
+    depth = np.random.default_rng(0).uniform(1, 2, (4, 6))
+    results.save_alone(tmp_path, depth, None)
+    np.testing.assert_array_equal(np.load(tmp_path / "depth_alone.npy"), depth.astype(np.float32))
+    assert (np.load(tmp_path / "confidence_alone.npy") == 0.5).all()
+    assert np.load(tmp_path / "confidence_alone.npy").dtype == np.float32
+
+
+def test_a_cleared_frame_keeps_the_files_of_others(tmp_path):
+    ours = "depth_alone.npy confidence_alone.npy depth.npy confidence.npy confirmed.npy asked.npy"
+    for extra, left in (("notes.txt", True), (None, False)):
+        folder = tmp_path / "a"
+        folder.mkdir(exist_ok=True)
+        for name in [
+            *ours.split()[: 6 if left else 5],
+            "depth_mm.png",
+            "depth.png",
+            "cloud.ply",
+            *filter(None, [extra]),
+        ]:
+            (folder / name).write_text("")
+        (folder / "report.json").write_text(json.dumps({"files": {"names": ["cloud.ply"]}}))
+        results.clear_frame(folder)
+        assert folder.exists() == left
+        if left:
+            assert [path.name for path in folder.iterdir()] == [extra]
+            (folder / extra).unlink()
+
+
+def test_finished_frames_of_a_video_become_steady_and_the_same_call_again_changes_nothing(
+    plain_figures, tmp_path
+):
+    """Depth by a run is kept on first use. The second scene has a frame more than the first."""
+    camera, size = np.array([[150.0, 0, 84.0], [0, 132.0, 68.0], [0, 0, 1]]), (170, 128)
+    images, frames, truths = [], [], []
+    for i in range(5):
+        turn, E = [10 + i, 15 - 2 * i + 180 * (i > 1), 20 + 3 * i], np.eye(4)
+        E[:3, :3] = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+        E[:3, 3] = 0.07 * i - 0.1, 0.04 * (i % 2), -0.3
+        image, depth = render(E, size, camera)
+        images.append(image.astype(np.float32) / 255)
+        truths.append(depth)
+        folder = tmp_path / f"f{i}"
+        folder.mkdir()
+        np.save(folder / "depth.npy", (depth * (1 + 0.01 * (-1) ** i)).astype(np.float32))
+        if i:
+            np.save(folder / "confidence.npy", np.full(depth.shape, 0.1 + 0.2 * i, np.float32))
+        frames.append(FinishedFrame(folder, camera, "m"))
+    before = [np.load(frame.folder / "depth.npy") for frame in frames]
+    assert results.write_steady(frames, images.__getitem__) == [0, 0, 1, 1, 1]
+    steady = [np.load(frame.folder / "depth.npy") for frame in frames]
+    for i, frame in enumerate(frames):
+        np.testing.assert_array_equal(np.load(frame.folder / "depth_alone.npy"), before[i])
+        sure = np.load(frame.folder / "confidence_alone.npy")
+        np.testing.assert_array_equal(sure, np.full(sure.shape, 0.1 + 0.2 * i if i else 0.5, np.float32))
+        middle = slice(40, 90), slice(50, 120)
+        off = [np.abs(depth / truths[i] - 1)[middle].mean() for depth in (steady[i], before[i])]
+        assert off[0] < 0.8 * off[1]
+        assert np.median(np.load(frame.folder / "asked.npy")[middle]) == (1 if i < 2 else 2)
+    results.write_steady(frames, images.__getitem__)
+    for frame, depth in zip(frames, steady, strict=True):
+        np.testing.assert_array_equal(np.load(frame.folder / "depth.npy"), depth)
+
+
+def written(capture: Capture, tmp_path, export=(), not_trusted=()):
+    out = tmp_path / "out"
+    results.write_agreement(capture, out, NAMES)
+    return out, results.write_results(capture, out, NAMES, export, not_trusted, None)
+
+
+@pytest.mark.parametrize("not_trusted", [["b"], NAMES])
+def test_the_cloud_of_a_capture_is_read_by_trimesh_with_its_cameras(
+    not_trusted, finished, plain_figures, tmp_path
+):
+    """Of a frame that is not trusted only confirmed pixels count, unless no frame is trusted."""
+    out, counts = written(finished, tmp_path, (), not_trusted)
+    frames = {}
+    for number, name in enumerate(NAMES):
+        depth, confidence, confirmed, asked = (
+            np.load(out / name / f"{m}.npy") for m in ("depth", "confidence", "confirmed", "asked")
+        )
+        asked = np.ones_like(asked) if not_trusted == [name] else asked
+        frames[name] = DepthFrame(name, depth, confidence, KS[number], ES[number], confirmed, asked)
+    cloud, normals = fuse(NAMES, frames.__getitem__, finished.image)
+    read = trimesh.load(out / "cloud.ply", process=False)
+    assert counts == {"cloud_points": len(cloud.points_m)}
+    np.testing.assert_allclose(read.vertices, cloud.points_m, atol=1e-6)
+    np.testing.assert_array_equal(read.colors[:, :3], cloud.colours)
+    data = read.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_allclose(np.stack([data[n] for n in ("nx", "ny", "nz")], -1), normals, atol=1e-6)
+    assert b"comment world frame, metres" in (out / "cloud.ply").read_bytes()[:200]
+    scene = trimesh.load(out / "cloud.glb")
+    shown = [g for g in scene.dump() if isinstance(g, trimesh.PointCloud)]
+    assert sum(len(g.vertices) for g in shown) == len(cloud.points_m)
+    pyramids = {name: g for name, g in scene.geometry.items() if not isinstance(g, trimesh.PointCloud)}
+    assert sorted(pyramids) == [f"camera {number}" for number in range(4)]
+    for number in range(4):
+        pyramid = pyramids[f"camera {number}"]
+        # OpenGL's axes. The corners at one depth are those of the image, (-0.5, -0.5) to (W - 0.5, H - 0.5).
+        corners = np.unique(np.round(np.asarray(pyramid.vertices) * [1, -1, -1], 6), axis=0)
+        seen = np.c_[corners, np.ones(5)] @ np.linalg.inv(ES[number]).T[:, :3]
+        apex = np.argmin(np.abs(seen).sum(1))
+        assert np.abs(seen[apex]).max() < 1e-4
+        pixels = np.delete(seen, apex, 0) @ KS[number].T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        width, height = SIZES[number]
+        expected = [[-0.5, -0.5], [-0.5, height - 0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5]]
+        np.testing.assert_allclose(sorted(pixels.round(2).tolist()), expected, atol=0.02)
+
+
+def test_exports_are_written_on_demand_from_the_agreed_frames(finished, plain_figures, tmp_path):
+    out, _ = written(finished, tmp_path, ("colmap", "nerfstudio"))
+    assert (out / "colmap/sparse/points3D.txt").is_file() and not (out / "mesh.ply").exists()
+    data = json.loads((out / "nerfstudio/transforms.json").read_text())
+    for number, (name, entry) in enumerate(zip(NAMES, data["frames"], strict=True)):
+        maps = [np.load(out / name / f"{m}.npy") for m in ("depth", "confidence", "confirmed", "asked")]
+        use = kept(DepthFrame(name, *maps[:2], KS[number], ES[number], *maps[2:]))
+        units = np.asarray(Image.open(out / "nerfstudio" / entry["depth_file_path"]))
+        np.testing.assert_array_equal(units > 0, use)
+        np.testing.assert_allclose(units[use], 1000 * maps[0][use], atol=0.51)
+        depth = read_colmap_map(out / "colmap/stereo/depth_maps" / f"{name}.png.geometric.bin")
+        np.testing.assert_array_equal(depth, np.where(use, maps[0], 0))
+
+
+def test_the_sheet_has_every_frame_and_its_depth_and_marks_those_that_are_not_trusted(
+    finished, tmp_path, monkeypatch
+):
+    """Frames of different sizes have colours of their own; of frames of one size those of a common range."""
+    sheets, grid = [], plotting.grid
+    monkeypatch.setattr(
+        plotting,
+        "grid",
+        lambda cells, titles, **how: sheets.append((cells, titles)) or grid(cells, titles, **how),
+    )
+    out, _ = written(finished, tmp_path, not_trusted=["c"])
+    ((cells, titles),) = sheets
+    assert titles == ["a", "depth", "b", "depth", "c", "depth, not trusted", "d", "depth"]
+    for number, name in enumerate(NAMES):
+        np.testing.assert_allclose(cells[2 * number], image_of(number), atol=1e-6)
+        drawn = plotting.depth_figure(np.load(out / name / "depth.npy"), unit="m")
+        np.testing.assert_array_equal(np.asarray(cells[2 * number + 1]), np.asarray(drawn))
+    with Image.open(out / "sheet.jpg") as sheet:
+        assert sheet.size == grid(cells, titles, columns=4, cell_width=360).size
+    results._sheet(finished, out, ["b"], [])
+    with Image.open(out / "sheet.jpg") as sheet:
+        assert sheet.size == grid(*sheets[-1], columns=2, cell_width=360).size
+    drawn, names = [], [f"{i:02d}" for i in range(60)]
+    depths = np.random.default_rng(0).uniform(1, 9, (60, 8, 10)).astype(np.float32)
+    for name, depth in zip(names, depths, strict=True):
+        (tmp_path / name).mkdir()
+        np.save(tmp_path / name / "depth.npy", depth * (1 + int(name)))
+    monkeypatch.setattr(finished, "image", lambda name: np.full((8, 10, 3), int(name) / 60))
+    few = [Image.new("RGB", (8, 6))] * 24
+    monkeypatch.setattr(plotting, "depth_frames", lambda depths, unit: drawn.append((depths, unit)) or few)
+    results._sheet(finished, tmp_path, names, [])
+    shown = sheets[-1][1][::2]
+    assert len(shown) == 24 and shown[0] == "00" and shown[-1] == "59"
+    assert set(np.diff([int(name) for name in shown])) == {2, 3}
+    together, unit = drawn[-1]
+    assert unit == "m" and len(sheets[-1][0]) == 48
+    np.testing.assert_array_equal(together, [np.load(tmp_path / name / "depth.npy") for name in shown])
+
+
+def test_the_video_shows_images_beside_depth_in_the_colours_of_one_range(
+    finished, plain_figures, tmp_path, monkeypatch
+):
+    """All frames have one size, whatever the size of their images."""
+    videos = []
+    monkeypatch.setattr(
+        plotting, "write_depth_video", lambda path, frames, fps: videos.append((path, list(frames), fps))
+    )
+    out, _ = written(finished, tmp_path)
+    ((path, frames, fps),) = videos
+    assert path == out / "video.mp4" and fps == 5 and len(frames) == 4
+    maps = [np.load(out / name / "depth.npy") for name in NAMES]
+    near, far = np.percentile(np.concatenate([depth[::8, ::8].ravel() for depth in maps]), (2, 98))
+    for number, frame in enumerate(frames):
+        assert frame.size == (1280, 480)
+        width, height = SIZES[number]
+        scale = min(1280 / (2 * width), 480 / height)
+        pair = [
+            np.rint(255 * image_of(number)).astype(np.uint8),
+            plotting.colour_depth(maps[number], near, far),
+        ]
+        shown = np.asarray(
+            Image.fromarray(np.hstack(pair)).resize(
+                (round(2 * width * scale), round(height * scale)), Image.BICUBIC
+            )
+        )
+        left, top = (1280 - shown.shape[1]) // 2, (480 - shown.shape[0]) // 2
+        inside = np.asarray(frame)[top : top + shown.shape[0], left : left + shown.shape[1]]
+        assert np.abs(inside.astype(int) - shown).mean() < 4
+
+
+class StandInGrid:
+    """Stands in for ``VoxelBlockGrid`` of Open3D: its mesh has the points of the depth maps.
+
+    As there, poses are world-to-camera, depth is divided by a scale, and what is beyond a bound is left out.
+    """
+
+    made = []
+
+    def __init__(self, names, types, channels, voxel, block, blocks):
+        assert (names, channels) == (("tsdf", "weight", "color"), ((1,), (1,), (3,)))
+        assert len(types) == 3 and block == 16 and blocks >= 1000
+        self.voxel, self.points, self.colours = voxel, [], []
+        StandInGrid.made.append(self)
+
+    def compute_unique_block_coordinates(self, depth, K, T, scale, most):
+        return depth.tobytes(), K.tobytes(), T.tobytes(), scale, most
+
+    def integrate(self, blocks, depth, colour, K_depth, K_colour, T, scale, most):
+        assert blocks == (depth.tobytes(), K_depth.tobytes(), T.tobytes(), scale, most)
+        assert depth.dtype == colour.dtype == np.float32 and K_depth.dtype == T.dtype == np.float64
+        np.testing.assert_array_equal(K_depth, K_colour)
+        rows, columns = np.nonzero((depth[..., 0] > 0) & (depth[..., 0] / scale < most))
+        for v, u in zip(rows, columns, strict=True):
+            point = np.linalg.solve(K_depth, [u, v, 1]) * depth[v, u, 0] / scale
+            self.points.append(np.linalg.solve(T, [*point, 1])[:3])
+            self.colours.append(colour[v, u])
+
+    def extract_triangle_mesh(self, weight_threshold):
+        assert 0 < weight_threshold < 1  # what one frame has seen counts
+        return self
+
+    def to_legacy(self):
+        return self
+
+    def compute_vertex_normals(self):
+        self.has_normals = True
+
+
+def test_a_mesh_is_made_of_the_kept_pixels_of_all_frames_by_their_own_cameras(tmp_path, monkeypatch):
+    """By a stand-in for Open3D, which is large."""
+    core = SimpleNamespace(Tensor=np.asarray, float32=np.float32)
+    tensors = SimpleNamespace(geometry=SimpleNamespace(VoxelBlockGrid=StandInGrid, Image=np.asarray))
+
+    def write(path: str, mesh: StandInGrid) -> None:
+        assert path.endswith(".ply") and mesh.has_normals
+        trimesh.PointCloud(mesh.points, np.rint(255 * np.array(mesh.colours)).astype(np.uint8)).export(path)
+
+    io = SimpleNamespace(write_triangle_mesh=write)
+    monkeypatch.setitem(sys.modules, "open3d", SimpleNamespace(core=core, t=tensors, io=io))
+    frames = {name: doubted(number) for number, name in enumerate(NAMES)}
+    write_mesh(tmp_path / "mesh.ply", NAMES, frames.__getitem__, lambda name: image_of(NAMES.index(name)))
+    points, colours = [], []
+    for number, frame in enumerate(frames.values()):
+        points.append(frame.world(kept(frame)))
+        colours.append(255 * image_of(number)[kept(frame)])
+    found = trimesh.load(tmp_path / "mesh.ply", process=False)
+    np.testing.assert_allclose(found.vertices, np.concatenate(points), atol=1e-5)
+    assert np.abs(found.colors[:, :3] - np.concatenate(colours)).max() < 0.51
+    median = np.median([np.median(frame.depth) for frame in frames.values()])
+    assert StandInGrid.made[-1].voxel == pytest.approx(0.004 * median, rel=1e-6)
+
+
+def test_a_video_that_cannot_be_written_is_warned_of(finished, plain_figures, tmp_path, monkeypatch):
+    """Everything else is there."""
+
+    def refuse(*_: object) -> None:
+        raise InputFileError("No codec.")
+
+    monkeypatch.setattr(plotting, "write_depth_video", refuse)
+    with pytest.warns(UserWarning, match="No codec") as caught:
+        out, counts = written(finished, tmp_path)
+    assert [warning.message.args[0].code for warning in caught] == ["capture.no-video"]
+    assert counts["cloud_points"] > 0 and (out / "sheet.jpg").is_file()
+
+
+def test_a_mesh_of_different_cameras_lies_on_the_walls(tmp_path):
+    open3d = pytest.importorskip("open3d")
+    frames = {name: frame_of(number, confidence=0.9) for number, name in enumerate(NAMES)}
+    write_mesh(tmp_path / "mesh.ply", NAMES, frames.__getitem__, lambda name: image_of(NAMES.index(name)))
+    corners = np.asarray(open3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply")).vertices)
+    off = np.abs(np.abs(corners) - HALF).min(1)
+    assert len(corners) > 1000 and np.median(off) < 0.01 and np.quantile(off, 0.9) < 0.05

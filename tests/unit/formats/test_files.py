@@ -1,0 +1,262 @@
+"""Files that a user names: what is refused and why, and texts, matrices and sizes as they are read."""
+
+import codecs
+import hashlib
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from geodiff_plugin._checks import InputError, InputFileError, MissingFileError
+from geodiff_plugin.formats import files
+from geodiff_plugin.formats.files import (
+    check_file,
+    file_digest,
+    find_map,
+    is_turned,
+    natural_order,
+    open_image,
+    parse_xml,
+    read_matrix,
+    read_npy,
+    read_rows,
+    read_text,
+    save_png,
+    stored_size,
+    upright_size,
+)
+
+RNG = np.random.default_rng(8)
+
+
+def test_a_path_that_is_no_readable_file_is_refused_with_its_kind(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "empty").touch()
+    (tmp_path / "good").write_text("x")
+    assert check_file(str(tmp_path / "good"), "K") == tmp_path / "good"
+    for name, error, said in (
+        ("", InputFileError, "K must be a thing; got the folder .* Name the file inside it."),
+        ("none", MissingFileError, "K must be a thing; got .*none, which does not exist"),
+        ("n" * 300, MissingFileError, "which does not exist"),
+        ("pipe", InputError, "which is a pipe or a device"),
+        ("empty", InputError, "which is empty. Was its download"),
+    ):
+        with pytest.raises(error, match=said):
+            check_file(tmp_path / name, "K", "a thing")
+    with pytest.raises(TypeError, match="K must be the path of a thing; got int"):
+        check_file(3, "K", "a thing")
+
+
+@pytest.mark.parametrize(
+    ("head", "said"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1", "a pointer of Git LFS"),
+        (b"\n <!DOCTYPE HTML><p>", "a web page"),
+        (b"<HTML lang='en'>", "a web page"),
+        (b"x" * 60 + b"<html", None),
+        (b"# the version https://git-lfs", None),
+    ],
+)
+def test_what_a_failed_download_left_is_no_file(head, said, tmp_path):
+    (tmp_path / "a").write_bytes(head)
+    if said is None:
+        check_file(tmp_path / "a", "left")
+        return
+    with pytest.raises(InputError, match=f"left must be a file; got .*, {said}"):
+        check_file(tmp_path / "a", "left")
+
+
+def test_images_that_cannot_be_opened_say_what_is_wrong(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"no image at all")
+    Image.fromarray(RNG.integers(0, 255, (50, 60, 3), np.uint8)).save(tmp_path / "b.png")
+    (tmp_path / "c.png").write_bytes((tmp_path / "b.png").read_bytes()[:-2000])
+    with pytest.raises(InputError, match="left must be an image file; got .*, a format that Pillow does not"):
+        stored_size(tmp_path / "a.png", "left")
+    with (
+        pytest.raises(InputError, match=r"left must be a whole image file; got .*, which does not decode"),
+        open_image(tmp_path / "c.png", "left") as image,
+    ):
+        image.load()
+    with pytest.raises(InputError, match=r"\Amine\Z"), open_image(tmp_path / "b.png", "left"):
+        raise InputError("mine")
+    assert stored_size(tmp_path / "b.png", "left") == (60, 50)
+
+
+@pytest.mark.parametrize("orientation", [None, *range(1, 10)])
+def test_an_image_is_turned_by_orientations_2_to_8_and_lies_on_its_side_from_5_on(orientation, tmp_path):
+    exif = Image.Exif()
+    if orientation is not None:
+        exif[0x0112] = orientation
+    for suffix in ("jpg", "png"):
+        path = tmp_path / f"a.{suffix}"
+        Image.new("RGB", (48, 40)).save(path, exif=exif)
+        number = orientation or 1
+        assert is_turned(path) == (2 <= number <= 8)
+        assert stored_size(path, "left") == (48, 40)
+        assert upright_size(path, "left") == ((40, 48) if number >= 5 else (48, 40))
+
+
+def test_pngs_are_written_whole_by_run_lengths(tmp_path):
+    values = RNG.integers(0, 255, (40, 50, 3), np.uint8)
+    with open(tmp_path / "a.bin", "wb") as file:
+        save_png(Image.fromarray(values), file)
+    with Image.open(tmp_path / "a.bin") as image:
+        assert image.format == "PNG"
+        np.testing.assert_array_equal(np.asarray(image), values)
+
+
+def test_maps_are_found_by_their_suffix_in_order(tmp_path):
+    assert find_map(tmp_path, "a") is None
+    (tmp_path / "a.npy").mkdir()
+    for suffix in (".png", ".pfm", ".npz"):
+        (tmp_path / f"a{suffix}").touch()
+        assert find_map(tmp_path, "a") == tmp_path / f"a{suffix}"
+    (tmp_path / "a.npy").rmdir()
+    (tmp_path / "a.npy").touch()
+    assert find_map(tmp_path, "a") == tmp_path / "a.npy" and find_map(tmp_path, "b") is None
+
+
+def test_numbers_in_names_are_counted():
+    order = ["2b", "10b", "f2.png", "f2a10.png", "f2a10b.jpg", "f2a10b.png", "f03.png", "f10.png", "g1"]
+    shuffled = [Path(order[i]) for i in RNG.permutation(len(order))]
+    assert [path.name for path in sorted(shuffled, key=natural_order)] == order
+
+
+@pytest.mark.parametrize(
+    ("raw", "text"),
+    [
+        (b"a\r\nb\rc\n", "a\nb\nc\n"),
+        (codecs.BOM_UTF8 + "Höhe 1".encode(), "Höhe 1"),
+        ("a 1\nb".encode("utf-16"), "a 1\nb"),
+        (codecs.BOM_UTF16_BE + "a 1\nb".encode("utf-16-be"), "a 1\nb"),
+        (b"caf\xe9 1", "caf\ufffd 1"),
+    ],
+)
+def test_texts_of_every_system_are_read_alike(raw, text, tmp_path):
+    (tmp_path / "a.txt").write_bytes(raw)
+    assert read_text(tmp_path / "a.txt", "K") == text
+
+
+@pytest.mark.parametrize(("raw", "said"), [(b"a\0b", "binary data"), (b" \n\t ", "only blanks")])
+def test_what_is_no_text_is_refused(raw, said, tmp_path, monkeypatch):
+    (tmp_path / "a.txt").write_bytes(raw)
+    with pytest.raises(InputError, match=f"which holds {said}. Is this an image"):
+        read_text(tmp_path / "a.txt", "K")
+    monkeypatch.setattr(files, "LARGEST_TEXT_BYTES", 10)
+    (tmp_path / "a.txt").write_bytes(b"x" * 10)
+    assert read_text(tmp_path / "a.txt", "K") == "x" * 10
+    (tmp_path / "a.txt").write_bytes(b"x" * 11)
+    with pytest.raises(InputError, match=r"K must be a text file; got .* of 11 bytes"):
+        read_text(tmp_path / "a.txt", "K")
+
+
+def test_an_xml_text_with_entities_is_refused():
+    assert parse_xml("\n <?xml version='1.0'?><a><b>1</b></a>\n").find("b").text == "1"
+    for text in ("<!DOCTYPE a><a/>", "<a><! entity x ''></a>"):
+        with pytest.raises(InputError, match="an XML file; got a document type with entities"):
+            parse_xml(text)
+
+
+def test_rows_lose_remarks_quotes_and_separators_and_keep_blank_lines_out(tmp_path):
+    text = '# head\n1, 2; 3\t4 // rest\n\n "a" , b,\n;5 6#7\n1,5\n'
+    (tmp_path / "a.txt").write_text(text)
+    assert read_rows(tmp_path / "a.txt", "K", "x") == [
+        ["1", "2", "3", "4"],
+        ["a", "b"],
+        ["5", "6"],
+        ["1", "5"],
+    ]
+    for line, word in (("1,5 2,5 3", "1,5"), ("7 -2,5e-3", "-2,5e-3"), ("1.5;+3,0;2", "+3,0")):
+        (tmp_path / "a.txt").write_text(f"1 2 3\n{line}\n")
+        with pytest.raises(InputError) as caught:
+            read_rows(tmp_path / "a.txt", "K", "x")
+        assert f"K must be numbers with a decimal point; got {tmp_path / 'a.txt'} with {word}." in str(
+            caught.value
+        )
+
+
+def test_a_digest_is_that_of_the_content_and_follows_a_change(tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    path.write_bytes(b"one")
+    os.utime(path, ns=(5, 5))
+    assert file_digest(path) == hashlib.sha256(b"one").hexdigest()
+    other = tmp_path / "b"
+    other.write_bytes(b"two")
+    os.utime(other, ns=(5, 5))
+    assert file_digest(other) == hashlib.sha256(b"two").hexdigest()
+    path.write_bytes(b"six")
+    os.utime(path, ns=(5, 6))
+    assert file_digest(path) == hashlib.sha256(b"six").hexdigest(), "another time"
+    path.write_bytes(b"eleven")
+    os.utime(path, ns=(5, 6))
+    assert file_digest(path) == hashlib.sha256(b"eleven").hexdigest(), "another size"
+    monkeypatch.setattr(Path, "open", lambda *_: pytest.fail("it was read again"))
+    assert file_digest(path) == hashlib.sha256(b"eleven").hexdigest()
+
+
+def test_arrays_of_real_numbers_alone_are_read_and_nothing_is_unpickled(tmp_path):
+    path = tmp_path / "a.npy"
+    for kind in (np.float16, np.int8, np.uint64):
+        np.save(path, np.arange(6).astype(kind).reshape(2, 3))
+        read = read_npy(path, "K", "numbers")
+        assert read.dtype == kind and read.tolist() == [[0, 1, 2], [3, 4, 5]]
+    for values in (np.array(["a"]), np.array([True]), np.array([1j])):
+        np.save(path, values)
+        with pytest.raises(InputError, match="K must be numbers; got .* without an array of real numbers"):
+            read_npy(path, "K", "numbers")
+    with open(path, "wb") as file:
+        np.savez(file, a=np.zeros(3))
+    with pytest.raises(InputError, match="without an array of real numbers"):
+        read_npy(path, "K", "numbers")
+    np.save(path, np.array([{}, 1], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="pickled objects, which are never loaded"):
+        read_npy(path, "K", "numbers")
+    path.write_bytes(b"\x80\x04K\x01.")
+    with pytest.raises(InputError, match="pickled objects, which are never loaded"):
+        read_npy(path, "K", "numbers")
+    path.write_bytes(b"1 2 3")
+    with pytest.raises(InputError, match="it is of another format"):
+        read_npy(path, "K", "numbers")
+
+
+@pytest.mark.parametrize("form", ["npy", "rows", "line", "brackets", "column"])
+@pytest.mark.parametrize("shape", [(3, 3), (3, 4), (4, 4)])
+def test_matrices_are_read_row_by_row_and_a_pose_gets_its_last_row(form, shape, tmp_path):
+    values = RNG.integers(-9, 9, shape) + 0.25
+    path = tmp_path / f"m.{'npy' if form == 'npy' else 'txt'}"
+    words = [[str(v) for v in row] for row in values]
+    flat = [word for row in words for word in row]
+    if form == "npy":
+        np.save(path, values[None].astype(np.float32))
+    else:
+        path.write_text(
+            {
+                "rows": "\n".join(", ".join(row) for row in words),
+                "line": " ".join(flat),
+                "brackets": "[" + ",\n ".join(f"[{', '.join(row)}]" for row in words) + "\n]",
+                "column": "\n".join(flat),
+            }[form]
+        )
+    expected = np.vstack([values, [[0, 0, 0, 1]]]) if shape == (3, 4) else values
+    read = read_matrix(path, "E")
+    np.testing.assert_array_equal(read, expected)
+    assert read.dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("500 500 320 240", r"of shape \(4,\). Are these fx fy cx cy"),
+        ("1 2 3\n4 5 6", r"of shape \(2, 3\)\.\Z"),
+        ("1 2 3\n4 5\n6 7 8", "with words in it, or rows of several lengths"),
+        ("fx 1 2\n0 1 2\n0 0 1", "with words in it"),
+        ("1 0 0\n0 nan 0\n0 0 1", "E must be finite; got NaN or infinity"),
+        ("1 0 0\n0 inf 0\n0 0 1", "E must be finite; got NaN or infinity"),
+    ],
+)
+def test_what_is_no_matrix_is_refused(text, said, tmp_path):
+    (tmp_path / "m.txt").write_text(text)
+    with pytest.raises(InputError, match=said):
+        read_matrix(tmp_path / "m.txt", "E")

@@ -1,0 +1,250 @@
+"""Videos frame by frame, and bags: which images are a pair, and every field of what is written."""
+
+import functools
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from geodiff_plugin._checks import InputError, InputFileError
+from geodiff_plugin.formats.recordings import (
+    BagFrame,
+    BagReader,
+    Stamp,
+    VideoReader,
+    both_halves,
+    is_bag,
+    is_video,
+    list_pairs,
+    stereo_calibration,
+    video_facts,
+    write_depth_bag,
+)
+
+SIZE = (64, 40)
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory) -> Path:
+    """Twelve frames, each of its own shade, redder to the right and greener downwards."""
+    path = tmp_path_factory.mktemp("video") / "v.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 12.5, SIZE)
+    v, u = np.mgrid[:40, :64]
+    for n in range(12):
+        writer.write(np.stack([np.full_like(u, 20 * n), 5 * v, 3 * u], axis=-1).astype(np.uint8))
+    writer.release()
+    return path
+
+
+def shade(image: np.ndarray) -> int:
+    return round(float(image[..., 2].mean()) * 255 / 20)
+
+
+def test_a_video_has_its_frames_its_rate_and_its_size(video, tmp_path):
+    facts = video_facts(video)
+    assert facts.frames == 12 and facts.fps == pytest.approx(12.5) and facts.size == SIZE
+    (tmp_path / "no.mp4").write_bytes(b"no video")
+    with pytest.raises(InputError, match="video must be a video that OpenCV reads; got"):
+        video_facts(tmp_path / "no.mp4")
+
+
+def test_frames_are_read_by_their_number_in_any_order(video):
+    with VideoReader(video) as reader:
+        for number in (3, 4, 11, 0, 7, 7, 2):
+            image = reader.read(number)
+            assert image.shape == (40, 64, 3) and image.dtype == np.float32 and shade(image) == number
+        red, green = image[..., 0], image[..., 1]
+        assert red[:, -8:].mean() > red[:, :8].mean() + 0.3 and green[-8:].mean() > green[:8].mean() + 0.3
+        for number in (12, 20):
+            with pytest.raises(InputFileError, match=rf"frame {number} of .* does not decode"):
+                reader.read(number)
+        assert shade(reader.read(5)) == 5
+
+
+def test_both_halves_are_the_left_and_the_right_one():
+    image = np.random.default_rng(0).random((4, 10, 3))
+    left, right = both_halves(image)
+    np.testing.assert_array_equal(left, image[:, :5])
+    np.testing.assert_array_equal(right, image[:, 5:])
+    assert left.flags.c_contiguous and right.flags.c_contiguous
+    with pytest.raises(InputError, match="of even width; got 9 pixels wide"):
+        both_halves(image[:, :9])
+
+
+@pytest.mark.parametrize(
+    ("name", "video", "bag"),
+    [
+        ("a.MP4", True, False),
+        ("a.mcap", False, True),
+        ("a.bag", False, True),
+        ("a.db3", False, True),
+        ("a.png", False, False),
+    ],
+)
+def test_recordings_are_told_by_their_suffix(name, video, bag, tmp_path):
+    assert is_video(Path(name)) == video and is_bag(Path(name)) == bag
+    assert not is_bag(tmp_path)
+    (tmp_path / "metadata.yaml").touch()
+    assert is_bag(tmp_path)
+
+
+pytest.importorskip("rosbags")
+from rosbags import rosbag1, rosbag2  # noqa: E402
+from rosbags.highlevel import AnyReader  # noqa: E402
+from rosbags.typesys import Stores, get_typestore  # noqa: E402
+
+typestore = functools.cache(get_typestore)  # which takes long
+START = 1_600_000_000_987_654_321
+
+
+def bag(path: Path, images: dict[str, list[tuple[int, int]]], sizes=((6, 4), (6, 4)), infos=()) -> Path:
+    """Images of one colour at milliseconds ``(of the header, of the recording)`` by topic; camera_infos."""
+    ros2 = path.suffix != ".bag"
+    store = typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
+    types, serialize = store.types, store.serialize_cdr if ros2 else store.serialize_ros1
+    plugin = {"version": 9, "storage_plugin": rosbag2.StoragePlugin.MCAP}
+    folder = path.with_suffix(".folder")
+    if not path.suffix:  # a folder as ROS 2 recorded it before files had the definitions of their messages
+        plugin, folder = {"version": 8, "storage_plugin": rosbag2.StoragePlugin.SQLITE3}, path
+    with rosbag2.Writer(folder, **plugin) if ros2 else rosbag1.Writer(path) as writer:
+
+        def header(at_ns: int, frame: str):
+            stamp = types["builtin_interfaces/msg/Time"](*divmod(at_ns, 10**9))
+            return types["std_msgs/msg/Header"](*(() if ros2 else (3,)), stamp, frame)
+
+        for side, (topic, stamps) in enumerate(images.items()):
+            to = writer.add_connection(topic, "sensor_msgs/msg/Image", typestore=store)
+            width, height = sizes[side]
+            for number, (at, recorded) in enumerate(stamps):
+                data = np.full(3 * width * height, 10 * number + 100 * side, np.uint8)
+                message = types["sensor_msgs/msg/Image"](
+                    header(START + 10**6 * at, f"eye{side}"), height, width, "rgb8", 0, 3 * width, data
+                )
+                writer.write(to, START + 10**6 * recorded, serialize(message, message.__msgtype__))
+        for side, (topic, width, height, model, K, P) in enumerate(infos):
+            to = writer.add_connection(topic, "sensor_msgs/msg/CameraInfo", typestore=store)
+            roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+            D, R = np.arange(5.0) + side, np.eye(3) + 0.1 * side
+            arrays = [np.asarray(each, float).ravel() for each in (D, K, R, P)]
+            message = types["sensor_msgs/msg/CameraInfo"](
+                header(START, f"info{side}"), height, width, model, *arrays, 0, 0, roi
+            )
+            writer.write(to, START, serialize(message, message.__msgtype__))
+    if path.suffix == ".mcap":
+        (folder / f"{folder.name}.mcap").rename(path)
+    return path
+
+
+TOPICS = ("/a/image", "/b/image")
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".bag", ""])
+def test_every_left_image_has_the_nearest_right_one_that_is_free(suffix, tmp_path):
+    """Recorded out of order, with two right images between two left ones, and one that is too far off."""
+    lefts = [(0, 9), (100, 110), (200, 205), (300, 301), (400, 402)]
+    rights = [(104, 120), (97, 98), (203, 204), (196, 230), (312, 313), (-11, 1), (399, 500)]
+    path = bag(tmp_path / f"a{suffix}", dict(zip(TOPICS, (lefts, rights), strict=True)))
+    pairs = list_pairs(path, TOPICS, 0.0105)
+    ms = [tuple((stamp.header_ns - START) / 1e6 for stamp in pair) for pair in pairs]
+    assert ms == [(100, 97), (200, 203), (400, 399)]
+    recorded = [tuple((stamp.recorded_ns - START) / 1e6 for stamp in pair) for pair in pairs]
+    assert recorded == [(110, 98), (205, 204), (402, 500)]
+    ms = [[(stamp.header_ns - START) // 10**6 for stamp in pair] for pair in list_pairs(path, TOPICS, 0.012)]
+    assert ms == [[0, -11], [100, 97], [200, 203], [300, 312], [400, 399]]
+    with BagReader(path, TOPICS, 0.0105) as reader:
+        for number, (left, right) in enumerate(((1, 1), (2, 2), (4, 6))):
+            image = reader.read(number)
+            assert image.shape == (4, 12, 3) and image.dtype == np.float32
+            np.testing.assert_allclose(image[:, :6], 10 * left / 255)
+            np.testing.assert_allclose(image[:, 6:], (10 * right + 100) / 255)
+    with pytest.raises(InputError, match=r"of the same moments; got 5 and 7 images, none within 0.0005 s"):
+        list_pairs(path, TOPICS, 0.0005)
+    with pytest.raises(
+        InputError,
+        match=r"/c must be a topic of images in the bag; got .* whose images are /a/image, /b/image",
+    ):
+        list_pairs(path, ("/c", TOPICS[1]), 0.01)
+
+
+def test_one_right_image_is_of_one_pair_only(tmp_path):
+    path = bag(tmp_path / "a.mcap", {TOPICS[0]: [(0, 0), (4, 4)], TOPICS[1]: [(2, 2)]})
+    assert [(pair[0].header_ns - START) // 10**6 for pair in list_pairs(path, TOPICS, 0.005)] == [0]
+
+
+def test_both_images_of_a_pair_must_be_of_one_size(tmp_path):
+    path = bag(tmp_path / "a.mcap", {TOPICS[0]: [(0, 0)], TOPICS[1]: [(0, 0)]}, ((6, 4), (8, 5)))
+    with (
+        BagReader(path, TOPICS, 0.01) as reader,
+        pytest.raises(InputFileError, match="one size; got 6x4 and 8x5"),
+    ):
+        reader.read(0)
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+def test_the_cameras_of_both_topics_are_those_beside_each(suffix, tmp_path):
+    topics = ("/one/image_rect_color", "/two/image_raw/compressed")
+    K = [np.array([[60.0 + n, 0, 31 + n], [0, 61.0 + n, 23], [0, 0, 1]]) for n in range(3)]
+    P = [np.column_stack([each, (-7.5 * n, 0, 0.5)]) for n, each in enumerate(K)]
+    infos = [
+        ("/one/camera_info", 64, 48, "plumb_bob", K[0], P[0]),
+        ("/two/calibration", 80, 50, "equidistant", K[1], P[1]),
+        ("/two/other_info", 1, 2, "x", K[2], P[2]),
+    ]
+    path = bag(tmp_path / f"a{suffix}", {"/x/image": [(0, 0)]}, infos=infos)
+    texts, frame_id = stereo_calibration(path, topics)
+    assert frame_id == "info0"
+    for side, (text, (_, width, height, model, k, p)) in enumerate(zip(texts, infos, strict=False)):
+        entries = yaml.safe_load(text)
+        assert (entries["width"], entries["height"], entries["distortion_model"]) == (width, height, model)
+        assert entries["rectified"] == (side == 0)
+        for key, expected in zip("DKRP", (np.arange(5.0) + side, k, np.eye(3) + 0.1 * side, p), strict=True):
+            np.testing.assert_allclose(entries[key], np.ravel(expected))
+    assert len(texts) == 2 and stereo_calibration(path, topics[::-1])[1] == "info1"
+    with pytest.raises(InputError, match="in the bag as /three/camera_info, or given; got neither"):
+        stereo_calibration(path, (topics[0], "/three/image"))
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_every_field_of_a_written_depth_is_that_of_its_frame(suffix, encoding, tmp_path):
+    frames = []
+    for number in range(3):
+        depth_m = np.random.default_rng(number).uniform(0.5, 9, (4 + number, 7)).astype(np.float32)
+        depth_m[0, :3] = np.nan, 0, -1
+        K = np.array([[60.0 + number, 0, 3.25], [0, 62.0, 2.5 + number], [0, 0, 1]])
+        frames.append(BagFrame(Stamp(START + 10**9 * number, START + 7 + 10**8 * number), depth_m, K))
+    path = tmp_path / f"d{suffix}"
+    assert write_depth_bag(path, frames, "eye", encoding) == 3
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+    with AnyReader([path]) as reader:
+        read = [(c.topic, at, reader.deserialize(raw, c.msgtype)) for c, at, raw in reader.messages()]
+    assert [topic for topic, *_ in read] == ["/depth/image", "/depth/camera_info"] * 3
+    for number, frame in enumerate(frames):
+        (_, at, image), (_, also_at, info) = read[2 * number : 2 * number + 2]
+        assert at == also_at == frame.stamp.recorded_ns
+        for message in (image, info):
+            stamp = message.header.stamp
+            assert stamp.sec * 10**9 + stamp.nanosec == frame.stamp.header_ns
+            assert message.header.frame_id == "eye" and (message.height, message.width) == frame.depth_m.shape
+        assert image.encoding == encoding and image.is_bigendian == 0
+        assert (
+            image.step == 7 * (2 if encoding == "16UC1" else 4)
+            and len(image.data) == image.step * image.height
+        )
+        values = image.data.view("<u2" if encoding == "16UC1" else "<f4").reshape(frame.depth_m.shape)
+        known = frame.depth_m > 0
+        if encoding == "16UC1":
+            np.testing.assert_array_equal(
+                values, np.where(known, np.rint(np.where(known, frame.depth_m, 0) * 1000.0), 0)
+            )
+        else:
+            np.testing.assert_array_equal(values, np.where(known, frame.depth_m, np.nan))
+        D, k, R, P = (getattr(info, key, getattr(info, key.upper(), None)) for key in "dkrp")
+        np.testing.assert_array_equal(np.reshape(k, (3, 3)), frame.K)
+        np.testing.assert_array_equal(np.reshape(P, (3, 4)), np.column_stack([frame.K, np.zeros(3)]))
+        np.testing.assert_array_equal(np.reshape(R, (3, 3)), np.eye(3))
+        assert info.distortion_model == "plumb_bob" and np.array_equal(D, np.zeros(5))
+        assert (info.binning_x, info.binning_y, info.roi.width, info.roi.do_rectify) == (0, 0, 0, False)
+        assert (info.roi.x_offset, info.roi.y_offset, info.roi.height) == (0, 0, 0)

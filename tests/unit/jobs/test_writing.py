@@ -1,0 +1,280 @@
+"""The folder of a result: every file and count against the maps of the run, and exports read by others."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from geodiff_plugin import plotting
+from geodiff_plugin.formats.out import OutFolder
+from geodiff_plugin.jobs import writing
+from geodiff_plugin.jobs.writing import cameras_of, pixels_of, write_into, write_maps, write_pair, write_row
+from tests.unit.jobs import made_runs
+
+MIN_CONFIDENCE = 0.55
+
+
+@pytest.fixture(autouse=True)
+def plain_figures(monkeypatch):
+    """Figures as small pictures, which are quick to draw; notes what they are drawn of."""
+    drawn = {}
+
+    def note(name):
+        def draw(*arguments, **named):
+            drawn[name] = (*arguments, named)
+            return Image.new("RGB", (4, 3))
+
+        return draw
+
+    for name in ("depth_figure", "share_figure", "overview"):
+        monkeypatch.setattr(plotting, name, note(name))
+    return drawn
+
+
+def one_map(values) -> np.ndarray:
+    return np.asarray(values)[0, :, :, 0]
+
+
+def flying(depth_m: np.ndarray) -> np.ndarray:
+    """Pixels of which fewer than three neighbours have their depth within 4 % of the nearer, one by one."""
+    height, width = depth_m.shape
+    found = np.zeros(depth_m.shape, bool)
+    for v in range(height):
+        for u in range(width):
+            if not depth_m[v, u] > 0:
+                continue
+            near = 0
+            for y in range(max(0, v - 1), min(height, v + 2)):
+                for x in range(max(0, u - 1), min(width, u + 2)):
+                    other = depth_m[y, x]
+                    if (y, x) != (v, u) and other > 0:
+                        near += abs(other - depth_m[v, u]) <= 0.04 * min(other, depth_m[v, u])
+            found[v, u] = near < 3
+    return found
+
+
+@pytest.fixture(scope="module")
+def run():
+    """Of a depth with some pixels that hang in the air."""
+    depth_m = made_runs.depth_map()
+    depth_m[25, 20], depth_m[26, 40] = 1.4, 1.5
+    return made_runs.run(made_runs.output(prediction=depth_m[None, ..., None]))
+
+
+def test_maps_and_counts_are_those_of_the_output(run, tmp_path, plain_figures):
+    output, left = run.output, run.inputs.left
+    told = write_maps(tmp_path, output, left, MIN_CONFIDENCE)
+    depth_m, confidence = one_map(output.prediction), one_map(output.confidence)
+    valid = (depth_m > 0) & (confidence > 0)
+    np.testing.assert_array_equal(np.load(tmp_path / "depth.npy"), depth_m)
+    for name in ("photometric_error", "uncertainty", "confidence"):
+        np.testing.assert_array_equal(np.load(tmp_path / f"{name}.npy"), one_map(getattr(output, name)), name)
+    np.testing.assert_array_equal(np.load(tmp_path / "normals.npy"), output.extras["normals"][0])
+    millimetres = np.asarray(Image.open(tmp_path / "depth_mm.png"))
+    np.testing.assert_array_equal(millimetres, np.rint(np.where(valid, depth_m, 0) * 1000.0))
+    seen = one_map(output.visible)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "visible.png")) == 255, seen)
+
+    hang, doubtful = flying(depth_m), confidence < MIN_CONFIDENCE
+    kept = valid & ~hang & ~doubtful
+    assert hang.sum() >= 2 and 0 < kept.sum() < (valid & ~hang).sum() < valid.sum()
+    assert told == {
+        "depth_mm_zero_pixels": (millimetres == 0).sum(),
+        "cloud_points": kept.sum(),
+        "flying_points": hang.sum(),
+        "doubtful_points": doubtful.sum(),
+        "points_out_of_reach": (~valid).sum(),
+    }
+    *_, (shown_left, _, _, error, _) = [plain_figures["overview"]]
+    np.testing.assert_array_equal(shown_left, np.rint(left * 255).astype(np.uint8))
+    assert np.isnan(error[~seen]).all()
+    np.testing.assert_array_equal(error[seen], one_map(output.photometric_error)[seen])
+    np.testing.assert_array_equal(plain_figures["share_figure"][0], confidence)
+    drawn, named = plain_figures["depth_figure"]
+    np.testing.assert_array_equal(drawn, depth_m)
+    assert named == {"unit": "m"}
+
+
+def test_the_cloud_holds_the_points_that_are_kept_with_their_colours(run, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    output, left = run.output, run.inputs.left
+    write_maps(tmp_path, output, left, MIN_CONFIDENCE)
+    depth_m, confidence, K = one_map(output.prediction), one_map(output.confidence), made_runs.K_LEFT
+    v, u = np.nonzero((depth_m > 0) & (confidence >= MIN_CONFIDENCE) & ~flying(depth_m))
+    z = depth_m[v, u].astype(float)
+    expected = np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], 1)
+    cloud = trimesh.load(tmp_path / "cloud.ply")
+    np.testing.assert_allclose(cloud.vertices, expected, atol=1e-5)
+    np.testing.assert_array_equal(cloud.colors[:, :3], np.rint(left * 255)[v, u])
+
+
+def test_an_output_without_a_second_view_writes_what_it_has(tmp_path, plain_figures):
+    alone = made_runs.output(
+        visible=None, photometric_error=None, confidence=None, uncertainty=None, extras={}, unit=None
+    )
+    told = write_maps(tmp_path, alone, made_runs.run().inputs.left, 0.9)
+    depth_m = one_map(alone.prediction)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *("depth.npy", "depth_mm.png", "depth.png", "overview.png", "cloud.ply")
+    }
+    assert told["doubtful_points"] == 0 and told["points_out_of_reach"] == (depth_m == 0).sum()
+    assert told["cloud_points"] == ((depth_m > 0) & ~flying(depth_m)).sum()
+    assert plain_figures["overview"][2:4] == (None, None)
+    assert plain_figures["depth_figure"][1] == {"unit": None}
+    assert b"metre" not in (tmp_path / "cloud.ply").read_bytes()[:400]
+
+
+def test_pixels_of_a_cloud_are_valid_confident_and_do_not_fly(run):
+    depth_m, confidence = one_map(run.output.prediction), one_map(run.output.confidence)
+    least = float(np.sort(confidence[confidence > 0])[300])
+    shown = pixels_of(run.output, run.inputs.left, least)
+    expected = (depth_m > 0) & (confidence >= least) & ~flying(depth_m)
+    np.testing.assert_array_equal(shown.valid, expected)
+    np.testing.assert_array_equal(shown.depth_m, depth_m)
+    np.testing.assert_array_equal(shown.K, made_runs.K_LEFT)
+    assert shown.image_01 is run.inputs.left and shown.K.dtype == np.float64
+    v, u = np.argwhere(confidence == np.float32(least))[0]
+    assert shown.valid[v, u] or flying(depth_m)[v, u] or not depth_m[v, u] > 0
+    bare = pixels_of(replace(run.output, confidence=None), run.inputs.left, 0.99)
+    np.testing.assert_array_equal(bare.valid, (depth_m > 0) & ~flying(depth_m))
+
+
+@pytest.mark.parametrize("rescaled", [1.0, 2.5])
+def test_cameras_of_all_views_are_in_the_unit_of_the_depth(run, rescaled):
+    refined = cameras_of(run.output, run.inputs.guidance)
+    given = cameras_of(replace(run.output, poses=[], rescaled=rescaled), run.inputs.guidance)
+    for cameras, poses, factor in ((refined, made_runs.REFINED, 1.0), (given, made_runs.POSES, rescaled)):
+        assert [camera.size for camera in cameras] == list(made_runs.SIZES)
+        np.testing.assert_array_equal(cameras[0].E, np.eye(4))
+        Ks = (made_runs.K_LEFT, *made_runs.K_RIGHTS)
+        for camera, K in zip(cameras, Ks, strict=True):
+            np.testing.assert_allclose(camera.K, K)
+        for camera, E in zip(cameras[1:], poses, strict=True):
+            np.testing.assert_allclose(camera.E[:3, :3], E[:3, :3])
+            np.testing.assert_allclose(camera.E[:3, 3], factor * E[:3, 3])
+            np.testing.assert_array_equal(camera.E[3], [0, 0, 0, 1])
+
+
+def write(run, folder: Path, **entries):
+    with OutFolder(folder) as out:
+        return write_pair(out, run, **entries)
+
+
+@pytest.mark.parametrize("rescaled", [1.0, 2.5])
+def test_a_colmap_model_puts_a_point_where_each_camera_sees_it(run, tmp_path, rescaled):
+    """Read by pycolmap: cameras, poses and points of a posed pair, also where the prior gave the metres."""
+    pycolmap = pytest.importorskip("pycolmap")
+    run = replace(run, options=replace(run.options, export=("colmap",), min_confidence=MIN_CONFIDENCE))
+    run = replace(run, output=replace(run.output, poses=[], rescaled=rescaled))
+    write(run, tmp_path / "out")
+    model = pycolmap.Reconstruction(tmp_path / "out")
+    names = sorted(image.name for image in model.images.values())
+    assert names == sorted(["left.png", "right.png", "third.png"]) and len(model.cameras) == 3
+    by_name = {image.name: image for image in model.images.values()}
+    views = zip(
+        ("left.png", "right.png", "third.png"), cameras_of(run.output, run.inputs.guidance), strict=True
+    )
+    for (name, view), E in zip(views, (np.eye(4), *made_runs.POSES), strict=True):
+        image = by_name[name]
+        centre = image.cam_from_world().inverse().translation
+        np.testing.assert_allclose(centre, rescaled * E[:3, 3], atol=1e-6)
+        camera = model.cameras[image.camera_id]
+        assert (camera.width, camera.height) == view.size
+        point = E[:3, :3] @ np.array([0.2, -0.1, 2.0]) + rescaled * E[:3, 3]
+        pixel = view.K @ [0.1, -0.05, 1.0]
+        np.testing.assert_allclose(image.project_point(point), pixel[:2] + 0.5, atol=1e-4)
+    shown = pixels_of(run.output, run.inputs.left, MIN_CONFIDENCE)
+    assert len(model.points3D) == shown.valid.sum()
+
+
+@pytest.mark.parametrize("kind", ["glb", "mesh"])
+def test_a_scene_for_viewers_holds_the_kept_surface_and_all_cameras(run, tmp_path, kind):
+    trimesh = pytest.importorskip("trimesh")
+    run = replace(run, options=replace(run.options, export=(kind,), min_confidence=MIN_CONFIDENCE))
+    write(run, tmp_path / "out")
+    name = {"glb": "cloud.glb", "mesh": "mesh.glb"}[kind]
+    assert [path.name for path in (tmp_path / "out").glob("*.glb")] == [name]
+    scene = trimesh.load(tmp_path / "out" / name)
+    sizes = [len(part.vertices) for part in scene.geometry.values()]
+    shown = pixels_of(run.output, run.inputs.left, MIN_CONFIDENCE)
+    if kind == "glb":
+        assert shown.valid.sum() in sizes
+    assert 0 < max(sizes) <= shown.valid.sum() and len(sizes) == 4
+
+
+def test_undistorted_views_are_written_and_named_in_the_model(run, tmp_path):
+    inputs = replace(run.inputs, undistorted=True)
+    run = replace(run, inputs=inputs, options=replace(run.options, export=("colmap",)))
+    write(run, tmp_path / "out")
+    text = (tmp_path / "out/images.txt").read_text()
+    views = [inputs.left, *(image.permute(1, 2, 0).numpy() for image in inputs.guidance.rights)]
+    for number, image in enumerate(views, 1):
+        name = "undistorted.png" if number == 1 else f"undistorted-{number}.png"
+        assert f" {number} {name}\n" in text
+        written = np.asarray(Image.open(tmp_path / "out" / name)) / 255
+        np.testing.assert_allclose(written, image, atol=0.5 / 255 + 1e-6)
+
+
+def target(folder: Path) -> Path:
+    """A camera 0.1 m to the right of the left one."""
+    E = made_runs.pose((1, -2, 0.5), (0.1, 0.02, -0.05))
+    camera = {"K": [[30, 0, 13], [0, 32, 11], [0, 0, 1]], "E": E.tolist(), "width": 28, "height": 24}
+    (folder / "camera.json").write_text(json.dumps(camera))
+    return folder / "camera.json"
+
+
+def test_depth_in_another_camera_is_that_of_the_same_points(tmp_path):
+    """Of a plane, whose depth in any camera is known."""
+    path, K = target(tmp_path), made_runs.K_LEFT
+    camera = json.loads(path.read_text())
+    normal, offset = np.array([0.1, -0.05, 1.0]), 2.5  # n . x = d
+    v, u = np.mgrid[:60, :80]
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], -1)
+    told = write_into(tmp_path, (offset / (rays @ normal)).astype(np.float32), K, path)
+    E, K_into = np.array(camera["E"]), np.array(camera["K"], float)
+    v, u = np.mgrid[:24, :28]
+    rays = np.stack([u, v, np.ones(u.shape)], -1) @ np.linalg.inv(K_into).T @ E[:3, :3].T
+    expected = (offset - normal @ E[:3, 3]) / (rays @ normal)
+    seen_m = np.load(tmp_path / "depth_into.npy")
+    assert seen_m.shape == (24, 28) and (seen_m > 0).mean() > 0.6
+    np.testing.assert_allclose(seen_m[seen_m > 0], expected[seen_m > 0], rtol=5e-3)
+    millimetres = np.asarray(Image.open(tmp_path / "depth_into_mm.png"))
+    np.testing.assert_array_equal(millimetres, np.rint(seen_m.astype(float) * 1000))
+    known = round((seen_m > 0).sum() / seen_m.size, 4)
+    np.testing.assert_allclose(told.pop("E"), E, atol=1e-9)  # its rotation is made exactly orthogonal
+    assert told == {"K": K_into.tolist(), "size": [28, 24], "known_share": known}
+
+
+def test_a_pair_is_written_with_all_that_its_options_ask_for(run, tmp_path):
+    options = replace(run.options, into=target(tmp_path), min_confidence=MIN_CONFIDENCE)
+    result = write(replace(run, options=options), tmp_path / "out", pair={"name": "a"}, note=7)
+    assert result.folder == tmp_path / "out" and result.run.output is run.output
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    assert report == json.loads(json.dumps(result.report))
+    assert report["pair"] == {"name": "a"} and report["note"] == 7
+    assert sorted(report["files"]["names"]) == sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert report["files"]["doubtful_points"] == (one_map(run.output.confidence) < MIN_CONFIDENCE).sum()
+    assert list(report["seconds"]) == ["calibration", "guided call", "write"]
+    assert report["seconds"]["calibration"] == 0.125 and report["seconds"]["guided call"] == 2.5
+    assert not (tmp_path / "out/undistorted.png").exists()
+    valid = one_map(run.output.valid)
+    expected = write_into(tmp_path, one_map(run.output.prediction) * valid, made_runs.K_LEFT, options.into)
+    assert report["into"] == expected
+    into = [np.load(folder / "depth_into.npy") for folder in (tmp_path, tmp_path / "out")]
+    np.testing.assert_array_equal(*into)
+
+
+def test_the_row_of_a_pair_is_that_of_the_report_which_is_written(run, tmp_path):
+    with OutFolder(tmp_path / "out") as out:
+        row = write_row(out, run, {"pair": {"name": "b"}})
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    assert report["pair"]["name"] == "b"
+    assert (row["near_m"], row["median_m"], row["far_m"]) == tuple(
+        report["depth"][f"{name}_m"] for name in ("min", "median", "max")
+    )
+    assert row["seconds"] == pytest.approx(sum(report["seconds"].values()), abs=1e-3)
+    assert row["verdict"] == "not trusted" and row["message"] == made_runs.WARNED
+    assert writing.INTO == ("depth_into.npy", "depth_into_mm.png")

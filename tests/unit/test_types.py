@@ -1,0 +1,157 @@
+"""Records shared by all layers: poses, reports of steps, verdicts of several images, depth elsewhere."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from geodiff_plugin.messages import Message
+from geodiff_plugin.types import (
+    CameraView,
+    DepthFrame,
+    Indicators,
+    MetricDepthOutput,
+    PosedViews,
+    Rig,
+    StepReport,
+    Verdict,
+)
+from tests.unit.jobs.made_runs import K_LEFT, pose
+
+E = pose((3.0, -7.0, 11.0), (0.12, -0.05, 0.2))
+REASON = Message("pose.inverse", "The inverse pose fits.")
+
+
+def test_a_rig_maps_points_of_the_left_camera_to_the_right_one():
+    rig = Rig(K_LEFT, K_LEFT, E)
+    point = np.array([0.3, -0.2, 2.0, 1.0])
+    in_right = rig.T_right_from_left @ point
+    np.testing.assert_allclose(E[:3, :3] @ in_right[:3] + E[:3, 3], point[:3])
+    np.testing.assert_allclose(rig.T_right_from_left @ np.append(E[:3, 3], 1.0), [0, 0, 0, 1], atol=1e-15)
+
+
+def test_the_size_of_views_is_that_of_the_left_image_with_or_without_a_batch():
+    left = torch.zeros(3, 5, 7)
+    views = (CameraView(torch.zeros(3, 8, 9), torch.eye(3), torch.eye(4)),)
+    assert PosedViews(left, views, torch.eye(3)).size == (5, 7)
+    assert PosedViews(left[None], views, torch.eye(3)).size == (5, 7)
+
+
+def test_a_step_report_keeps_every_value_on_its_way_to_the_cpu():
+    values = {name: torch.tensor([float(n), n + 0.5]) for n, name in enumerate(("s_hat", "t_hat", "g_s"), 1)}
+    report = StepReport(3, 250.0, **values, loss=torch.tensor([0.7, 0.8]), terms={"a": torch.tensor([9.0])})
+    moved = report.cpu()
+    assert (moved.step, moved.timestep) == (3, 250.0) and moved.visible_fraction is None
+    for name in ("s_hat", "t_hat", "g_s", "loss"):
+        assert torch.equal(getattr(moved, name), getattr(report, name)), name
+    assert moved.terms == {"a": torch.tensor([9.0])}
+    on_meta = StepReport(0, 1.0, *(torch.zeros(2) for _ in range(3)), terms={"a": torch.zeros(2)})
+    assert on_meta.cpu().terms["a"].device.type == "cpu"
+
+
+def verdict(status: str, *reasons: Message) -> Verdict:
+    return Verdict(status, reasons, (), Indicators())
+
+
+def test_a_verdict_says_what_forbids_trust_or_that_nothing_tests_it():
+    assert verdict("trusted").message is None and verdict("trusted").sentence == ""
+    assert verdict("trusted").trusted and not verdict("not judged").trusted
+    bad = verdict("not trusted", REASON, REASON)
+    assert bad.message.code == "verdict.not-trusted" and bad.sentence.endswith(f"{REASON} {REASON}")
+    unjudged = verdict("not judged", REASON).message
+    assert unjudged.code == "verdict.not-judged" and "neither matches of two views" in unjudged
+    assert not bad.trusted
+
+
+@pytest.mark.parametrize(
+    ("statuses", "worst"),
+    [
+        (("trusted", "not judged", "not trusted", "not trusted"), 2),
+        (("trusted", "not judged", "trusted"), 1),
+        (("trusted", "trusted"), 0),
+        (("not judged", "trusted"), 0),
+    ],
+)
+def test_the_verdict_on_a_batch_is_that_of_the_first_of_the_worst_images(statuses, worst):
+    verdicts = [verdict(status) for status in statuses]
+    output = MetricDepthOutput(np.ones((len(statuses), 2, 2, 1)), verdicts=verdicts)
+    assert output.verdict is verdicts[worst]
+    with pytest.raises(AttributeError, match="no verdict"):
+        _ = MetricDepthOutput(np.ones((1, 2, 2, 1))).verdict
+
+
+def plane(K: np.ndarray, height: int, width: int, offset: float) -> np.ndarray:
+    """Depth of the plane ``n . x = offset`` with a tilted normal."""
+    v, u = np.mgrid[:height, :width]
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], -1)
+    return (offset / (rays @ [0.1, -0.05, 1.0])).astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", ["numpy", "torch"])
+def test_depth_in_another_camera_is_made_of_each_image_with_its_own_k(kind):
+    """Of two planes, taken by different cameras; one image has a hole, the other pixels out of reach."""
+    Ks = np.stack([K_LEFT, K_LEFT @ np.diag([1.2, 1.15, 1.0])]).astype(np.float32)
+    depths = np.stack([plane(K, 48, 64, offset) for K, offset in zip(Ks, (2.0, 3.5), strict=True)])
+    confidence = np.full_like(depths, 0.8)
+    depths[0, 10:20, 15:30] = 0.0
+    confidence[1, 30:40, 35:50] = 0.0
+    into = pose((0, 0, 0), (0.1, 0.02, -0.05))
+    K_into = np.array([[40.0, 0, 15.0], [0, 44.0, 12.0], [0, 0, 1]])
+    prediction, sure, K = depths[..., None], confidence[..., None], Ks
+    if kind == "torch":
+        prediction, sure = (torch.from_numpy(x[:, None]) for x in (depths, confidence))
+        K = torch.from_numpy(Ks)
+    output = MetricDepthOutput(prediction, confidence=sure, K=K)
+    assert output.valid.shape == prediction.shape
+    np.testing.assert_array_equal(
+        np.asarray(output.valid).reshape(depths.shape), (depths > 0) & (confidence > 0)
+    )
+    seen = output.into(K_into, into, (32, 26))
+    assert tuple(seen.shape) == ((2, 26, 32, 1) if kind == "numpy" else (2, 1, 26, 32))
+    seen = np.asarray(seen).reshape(2, 26, 32)
+    v, u = np.mgrid[:26, :32]
+    rays = np.stack([(u - 15.0) / 40, (v - 12.0) / 44, np.ones(u.shape)], -1)
+    normal = np.array([0.1, -0.05, 1.0])
+    for number, offset in enumerate((2.0, 3.5)):
+        expected = (offset - normal @ into[:3, 3]) / (rays @ normal)
+        known = seen[number] > 0
+        assert 0.5 < known.mean() < 0.97, "what is unknown there has no depth"
+        np.testing.assert_allclose(seen[number][known], expected[known], rtol=0.01)
+    without = MetricDepthOutput(prediction)
+    np.testing.assert_array_equal(np.asarray(without.valid).reshape(depths.shape), depths > 0)
+    with pytest.raises(AttributeError, match="no K"):
+        without.into(K_into, into, (32, 26))
+
+
+def test_an_output_is_shown_by_its_size_range_and_verdicts():
+    depth = np.array([[1.5, math.nan], [7.25, 3.0]], np.float32)[None, ..., None]
+    output = MetricDepthOutput(
+        depth,
+        verdicts=[verdict("not trusted", REASON), verdict("trusted")],
+        warnings=[REASON] * 2,
+        assumed=[REASON] * 3,
+    )
+    text = repr(output)
+    assert text.splitlines() == [
+        "MetricDepthOutput(depth (1, 2, 2, 1), 1.5 to 7.25 m",
+        f"  not trusted: {REASON}",
+        "  trusted",
+        "  2 warnings",
+        "  3 assumptions)",
+    ]
+    assert repr(MetricDepthOutput(torch.ones(1, 1, 2, 2), unit=None)).splitlines()[0].endswith("1 to 1")
+
+
+def test_the_points_of_a_frame_are_those_of_its_pixels_in_the_world():
+    height, width = 5, 7
+    depth = np.linspace(1.0, 3.0, height * width).reshape(height, width)
+    frame = DepthFrame("a", depth, np.ones_like(depth), K_LEFT, E)
+    every = frame.world().reshape(height, width, 3)
+    for v, u in ((0, 0), (1, 5), (4, 2)):
+        z = depth[v, u]
+        x, y = (u - K_LEFT[0, 2]) / K_LEFT[0, 0] * z, (v - K_LEFT[1, 2]) / K_LEFT[1, 1] * z
+        np.testing.assert_allclose(every[v, u], E[:3, :3] @ [x, y, z] + E[:3, 3])
+    mask = np.zeros(depth.shape, bool)
+    mask[1, 5] = mask[3, 0] = True
+    np.testing.assert_allclose(frame.world(mask), [every[1, 5], every[3, 0]])
