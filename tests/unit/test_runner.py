@@ -19,7 +19,8 @@ from geodiff_plugin import InputError
 from geodiff_plugin.jobs import many
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard, fingerprint
 from geodiff_plugin.jobs.runner import Runner, SideBySide
-from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcess
+from geodiff_plugin.jobs.separate import SeparateProcess
+from tests.unit.jobs.work_elsewhere import by_process
 
 CHILD = """
 import sys, time
@@ -318,23 +319,8 @@ def test_what_is_no_shard_is_refused(typed):
         Shard.of(typed)
 
 
-def by_process(item: Item) -> dict:
-    """What other processes do."""
-    if item.payload == "sleeps":
-        time.sleep(600)
-    if item.payload == "defect":
-        raise KeyError(item.key)
-    if item.payload == "fails":
-        raise ValueError(f"{item.key} has no camera")
-    if item.payload == "kills":
-        os._exit(7)
-    if item.payload == "cannot":
-        raise ProcessEnded("It cannot begin.")
-    return {"by": os.getpid()}
-
-
 def go_beside(folder, payloads, count=2, stage=by_process):
-    processes = [SeparateProcess(__name__) for _ in range(count)]
+    processes = [SeparateProcess(by_process.__module__) for _ in range(count)]
     try:
         with Journal(folder / "job.jsonl") as journal:
             items = [Item(f"item{n}", payload) for n, payload in enumerate(payloads)]
