@@ -10,7 +10,8 @@ import inspect
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import Field, dataclass, field, fields, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -32,6 +33,24 @@ DEFAULT_WEIGHTS = {"photometric": 1.0, "matches": 1.0, "points": 1.0, "prior_pul
 TINY = 1e-9
 
 
+class Affects(StrEnum):
+    """What becomes stale with another value of a setting, as every field of settings declares."""
+
+    NOTHING = "nothing"  # of what is stored, or only its rounding
+    INPUTS = "inputs"  # through the files that it names, which count by their content
+    POSES = "poses"  # of a capture, and every result made with them
+    EVIDENCE = "evidence"  # what act 1 finds in the views, and every result made from it
+    RESULT = "result"
+
+
+EVIDENCE, RESULT = Affects.EVIDENCE, Affects.RESULT
+
+
+def affected(described: Field[Any]) -> Affects | None:
+    """What a field declares that it affects; ``None`` if it declares nothing."""
+    return described.metadata.get("affects")
+
+
 class _FrozenDict(dict[str, Any]):
     """A dict that cannot be changed, so that a configuration can hold it; equal to a dict of its items."""
 
@@ -48,7 +67,13 @@ class _FrozenDict(dict[str, Any]):
 
 
 def _knob(
-    default: Any, values: str, check: Callable[[Any, str], Any], paper: str = "{}", unset: str = ""
+    default: Any,
+    values: str,
+    check: Callable[[Any, str], Any],
+    *,
+    affects: Affects,
+    paper: str = "{}",
+    unset: str = "",
 ) -> Any:
     """A field with what is known about it beside the sentence on what it does.
 
@@ -60,11 +85,11 @@ def _knob(
         return None if unset and value is None else check(value, name)
 
     values += ", or `None`" if unset else ""
-    metadata = {"values": values, "check": checked, "paper": paper, "unset": unset}
+    metadata = {"values": values, "check": checked, "paper": paper, "unset": unset, "affects": affects}
     return field(default=default, metadata=metadata)
 
 
-def _number(default: float | None, low: float, high: float, kind: type = float, **more: str) -> Any:
+def _number(default: float | None, low: float, high: float, kind: type = float, **more: Any) -> Any:
     """A finite number in ``[low, high]``, or a whole one."""
     whole = kind is int
     values = f"{'integer, ' * whole}[{number_text(low)}, {number_text(high)}]"
@@ -73,17 +98,17 @@ def _number(default: float | None, low: float, high: float, kind: type = float, 
     )
 
 
-def _flag(default: bool, **more: str) -> Any:
+def _flag(default: bool, **more: Any) -> Any:
     return _knob(default, "bool", check_flag, **more)
 
 
-def _choice(*choices: str, **more: str) -> Any:
+def _choice(*choices: str, **more: Any) -> Any:
     """One of some names, the default first."""
     values = ", ".join(f"`{name}`" for name in choices)
     return _knob(choices[0], values, lambda v, name: check_choice(v, name, choices), **more)
 
 
-def _text(default: str, values: str, **more: str) -> Any:
+def _text(default: str, values: str, **more: Any) -> Any:
     """A text that is not empty; only the code that uses it can say whether the text is valid."""
 
     def check(value: Any, name: str) -> str:
@@ -93,7 +118,7 @@ def _text(default: str, values: str, **more: str) -> Any:
     return _knob(default, values, check, **more)
 
 
-def _pair(default: tuple[float, float] | None, **more: str) -> Any:
+def _pair(default: tuple[float, float] | None, **more: Any) -> Any:
     """Two numbers in metres, ``0 < low < high``; a list is taken for a tuple."""
     return _knob(default, "pair with 0 < low < high, m", check_range, **more)
 
@@ -113,7 +138,7 @@ def _weights(default: Mapping[str, float]) -> Any:
             weights[key] = float(check_number(weight, f"{name}[{key!r}]", 0.0, float("inf")))
         return _FrozenDict(weights)
 
-    return _knob(_FrozenDict(default), "term -> >= 0", check)
+    return _knob(_FrozenDict(default), "term -> >= 0", check, affects=RESULT)
 
 
 class UpdatePlan(NamedTuple):
@@ -187,46 +212,50 @@ class GuidanceConfig:
         InputError: a value of the wrong type or out of range, naming the knob.
     """
 
-    gradient: str = _choice("denoised", "full")
+    gradient: str = _choice("denoised", "full", affects=RESULT)
     weights: Mapping[str, float] = _weights(DEFAULT_WEIGHTS)
-    min_steps: int = _number(4, 1, 1000, int, paper="{}, not given")
-    respace: bool = _flag(True)
-    sweep_pixels: int = _number(210_000, 1024, 1 << 32, int, paper="{} (768 px, S9)")
+    min_steps: int = _number(4, 1, 1000, int, affects=RESULT, paper="{}, not given")
+    respace: bool = _flag(True, affects=RESULT)
+    sweep_pixels: int = _number(210_000, 1024, 1 << 32, int, affects=EVIDENCE, paper="{} (768 px, S9)")
     depth_range: tuple[float, float] | None = _pair(
-        None, paper="-", unset="from the nearest plane to a shift of 0.3 px"
+        None, affects=EVIDENCE, paper="-", unset="from the nearest plane to a shift of 0.3 px"
     )
-    pose: str = _choice("refine", "given")
-    clean_photographs: bool = _flag(True)
-    decoder: str = _text("full", "`full`, `tiny`, a folder or a hub id", paper="-")
-    eta: float = _number(0.85, 0, 1, paper="{}, not given")
-    pyramid_levels: int = _number(3, 1, 10, int)
-    exposure: bool = _flag(True)
-    z_test: bool = _flag(True)
-    min_visible: float = _number(0.1, 0, 1)
-    pull_to: str = _choice("start", "zero")
-    points_loss: str = _choice("robust", "l1l2", paper="-")
-    planes: int = _number(160, 24, 4096, int, paper="-")
-    search: str = _choice("volume", "one-number", "points-range")
-    positive: str = _choice("softplus", "square")
-    g_s_range: tuple[float, float] = _pair((1.0, 80.0), paper="{}, not given")
-    g_s_candidates: int = _number(80, 2, 100_000, int, paper="{}, not given")
-    reject_reflections: bool = _flag(True)
-    correct: bool = _flag(True)
-    corrections: int = _number(2, 1, 10_000, int, paper="-")
-    even_ensemble: str = _choice("mean", "lower", paper="-")
-    ensemble_at: str = _choice("processing", "image", paper="-")
-    crisp: bool = _flag(True)
-    smoothness: float = _number(40.0, TINY, 1e6, paper="-")
-    match_noise: float = _number(0.02, TINY, 1e3, paper="-")
-    outlier_width: float = _number(3.0, TINY, 1e6, paper="-")
-    rule: str = _text("adam", "key of `RULES`")
-    step_latents: float | None = _number(None, 0, 1e6, unset="0.03 after a correction, else 0.1")
-    step_affine: float = _number(0.01, 0, 1e6)
-    inner_steps: int | None = _number(None, 0, 10_000, int, unset="0 after a correction, else 40")
-    optimize_latents: bool = _flag(True)
-    start: float = _number(0.0, 0, 1)
-    stop: float = _number(1.0, 0, 1)
-    step_from: str = _choice("given", "updated")
+    pose: str = _choice("refine", "given", affects=EVIDENCE)
+    clean_photographs: bool = _flag(True, affects=EVIDENCE)
+    decoder: str = _text("full", "`full`, `tiny`, a folder or a hub id", affects=RESULT, paper="-")
+    eta: float = _number(0.85, 0, 1, affects=RESULT, paper="{}, not given")
+    pyramid_levels: int = _number(3, 1, 10, int, affects=RESULT)
+    exposure: bool = _flag(True, affects=RESULT)
+    z_test: bool = _flag(True, affects=RESULT)
+    min_visible: float = _number(0.1, 0, 1, affects=RESULT)
+    pull_to: str = _choice("start", "zero", affects=RESULT)
+    points_loss: str = _choice("robust", "l1l2", affects=RESULT, paper="-")
+    planes: int = _number(160, 24, 4096, int, affects=EVIDENCE, paper="-")
+    search: str = _choice("volume", "one-number", "points-range", affects=EVIDENCE)
+    positive: str = _choice("softplus", "square", affects=RESULT)
+    g_s_range: tuple[float, float] = _pair((1.0, 80.0), affects=RESULT, paper="{}, not given")
+    g_s_candidates: int = _number(80, 2, 100_000, int, affects=RESULT, paper="{}, not given")
+    reject_reflections: bool = _flag(True, affects=RESULT)
+    correct: bool = _flag(True, affects=RESULT)
+    corrections: int = _number(2, 1, 10_000, int, affects=RESULT, paper="-")
+    even_ensemble: str = _choice("mean", "lower", affects=RESULT, paper="-")
+    ensemble_at: str = _choice("processing", "image", affects=RESULT, paper="-")
+    crisp: bool = _flag(True, affects=EVIDENCE)
+    smoothness: float = _number(40.0, TINY, 1e6, affects=RESULT, paper="-")
+    match_noise: float = _number(0.02, TINY, 1e3, affects=RESULT, paper="-")
+    outlier_width: float = _number(3.0, TINY, 1e6, affects=RESULT, paper="-")
+    rule: str = _text("adam", "key of `RULES`", affects=RESULT)
+    step_latents: float | None = _number(
+        None, 0, 1e6, affects=RESULT, unset="0.03 after a correction, else 0.1"
+    )
+    step_affine: float = _number(0.01, 0, 1e6, affects=RESULT)
+    inner_steps: int | None = _number(
+        None, 0, 10_000, int, affects=RESULT, unset="0 after a correction, else 40"
+    )
+    optimize_latents: bool = _flag(True, affects=RESULT)
+    start: float = _number(0.0, 0, 1, affects=RESULT)
+    stop: float = _number(1.0, 0, 1, affects=RESULT)
+    step_from: str = _choice("given", "updated", affects=RESULT)
 
     def __post_init__(self) -> None:
         for described in fields(self):

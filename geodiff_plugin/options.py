@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from geodiff_plugin._checks import bad_value, check_choice, check_number, check_positive, refuse
 from geodiff_plugin._lazy import imported
+from geodiff_plugin.config import Affects
 
 if TYPE_CHECKING:
     from geodiff_plugin.config import GuidanceConfig
@@ -48,6 +49,7 @@ PANELS = (
     MACHINES,
     SPEED,
 )
+NOTHING, RESULT = Affects.NOTHING, Affects.RESULT
 DTYPES = ("float32", "float16", "bfloat16")
 #: Keys of ``scale.space.SPACES``, which cannot be imported without torch; a test keeps them the same.
 SPACES = ("depth", "disparity", "log", "log1p", "sqrt_disparity")
@@ -110,15 +112,17 @@ def declare(
     choices: tuple[str, ...] = (),
     split: bool = False,
     metavar: str | None = None,
+    affects: Affects | None = None,
 ) -> Any:
     """A field of a dataclass of options: its default, ``MISSING`` where it must be given, and its help.
 
     ``flags`` are as typed, where that is not ``--name-with-dashes``, ``""`` for an argument without a name. A
     number lies between ``low`` and ``high``, or is finite and above 0, in the unit ``above_0``. A tuple is
-    typed with commas where ``split``, otherwise its option is repeated.
+    typed with commas where ``split``, otherwise its option is repeated. ``affects`` decides whether what is
+    finished is kept when the value changes; commands that keep nothing need not declare it.
     """
     rules = OptionRules(help_text, flags, panel, low, high, above_0, choices, split, metavar)
-    return dataclasses.field(default=default, metadata={"rules": rules})
+    return dataclasses.field(default=default, metadata={"rules": rules, "affects": affects})
 
 
 def flag_of(field: Field[Any]) -> str:
@@ -157,19 +161,19 @@ def check_options(options: Any, name_of: Callable[[Field[Any]], str] = flag_of) 
 def workers_option() -> Any:
     """How many processes of Ray hold the prior."""
     about = "With --engine ray: processes that hold the prior (default: as many as fit)."
-    return declare(None, about, low=1, high=10**6, panel=MACHINES)
+    return declare(None, about, low=1, high=10**6, panel=MACHINES, affects=NOTHING)
 
 
 def gpus_option() -> Any:
     """GPUs of each process of Ray."""
     about = "With --engine ray: GPUs of each process, also a fraction (default: 1 where there are any)."
-    return declare(None, about, low=0, high=64, panel=MACHINES)
+    return declare(None, about, low=0, high=64, panel=MACHINES, affects=NOTHING)
 
 
 def engine_option() -> Any:
     """What works on many items."""
     about = "local (this machine) or ray (Ray Data, on one machine or a cluster; extra 'ray')."
-    return declare("local", about, choices=ENGINES, panel=MACHINES)
+    return declare("local", about, choices=ENGINES, panel=MACHINES, affects=NOTHING)
 
 
 def check_engine(options: Any) -> None:
@@ -181,7 +185,8 @@ def check_engine(options: Any) -> None:
             refuse(f"--{name} needs --engine ray.")
 
 
-_prior, _guidance = partial(declare, panel=PRIOR), partial(declare, panel=GUIDANCE)
+_prior = partial(declare, panel=PRIOR, affects=RESULT)
+_guidance = partial(declare, panel=GUIDANCE, affects=RESULT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +207,7 @@ class PriorOptions:
         None, "Denoising steps (default: the prior's own number, at least 4).", low=1, high=1000
     )
     seed: int = _prior(0, "Seed of the noise.", low=0, high=2**63 - 1)
-    device: str = _prior("auto", "Where it runs: auto, cpu, cuda, cuda:N or mps.")
+    device: str = _prior("auto", "Where it runs: auto, cpu, cuda, cuda:N or mps.", affects=NOTHING)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,8 +219,11 @@ class SpeedOptions:
         "Run the networks as CUDA graphs, with a faster group norm in half precision (for many pairs and "
         "captures this is done anyway).",
         panel=SPEED,
+        affects=NOTHING,
     )
-    no_kernels: bool = declare(False, "Run every stage in plain torch, without Triton kernels.", panel=SPEED)
+    no_kernels: bool = declare(
+        False, "Run every stage in plain torch, without Triton kernels.", panel=SPEED, affects=NOTHING
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

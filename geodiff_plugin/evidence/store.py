@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import time
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from geodiff_plugin.config import GuidanceConfig
+from geodiff_plugin.config import Affects, GuidanceConfig, affected
 from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.inputs import Inputs
 from geodiff_plugin.evidence.prepare import make_evidence
+
+#: The settings that evidence is made by; the others count where they decide whether it needs matches.
+_OF_EVIDENCE = [field.name for field in fields(GuidanceConfig) if affected(field) is Affects.EVIDENCE]
 
 
 class _Entry(NamedTuple):
@@ -41,9 +45,8 @@ class EvidenceStore:
         """What ``make_evidence`` gives for these arguments; the caller must not change it."""
         views = [value for view in given.views for value in view]
         tensors = [left_01, torch.from_numpy(given.K_left), given.points, *views]
-        knobs = ("pose", "crisp", "clean_photographs", "depth_range", "planes", "sweep_pixels")
         needs_matches = config.needs_matches(given.points is not None)
-        settings = (*(getattr(config, name) for name in knobs), config.search == "volume")
+        settings = tuple(getattr(config, name) for name in _OF_EVIDENCE)
         settings = (*settings, needs_matches, measured_baseline, given.unit)
         for entry in self._entries:
             comparable = entry.settings == settings and len(entry.tensors) == len(tensors)

@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 from geodiff_plugin._checks import bad_value
+from geodiff_plugin.config import Affects, affected
 from geodiff_plugin.formats.files import file_digest
 from geodiff_plugin.jobs.changes import input_change, option_changes
 from geodiff_plugin.jobs.options import DepthOptions
@@ -14,12 +15,6 @@ from geodiff_plugin.jobs.report import read_report
 from geodiff_plugin.options import flag_of
 
 Row = dict[str, Any]
-#: Options that a result does not depend on.
-NOT_OF_THE_RESULT = {
-    *("out", "overwrite", "quiet", "json", "strict", "steady", "shard"),
-    *("engine", "layout", "workers", "gpus"),
-    *("device", "graphs", "no_kernels", "encoding"),
-}
 
 
 def file_digests(options: DepthOptions) -> dict[str, str]:
@@ -37,7 +32,7 @@ def changed_options(options: DepthOptions, made: Mapping[str, Any]) -> list[str]
     Of an option that ``made`` does not know, as it is a newer one, nothing is said.
     """
     wanted, of_fields = options.as_json(), DepthOptions.__dataclass_fields__
-    names = [name for name in wanted if name in made and name not in NOT_OF_THE_RESULT]
+    names = [name for name in wanted if name in made and affected(of_fields[name]) is not Affects.NOTHING]
     before, now = ({flag_of(of_fields[name]): values[name] for name in names} for values in (made, wanted))
     return option_changes(before, now)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from geodiff_plugin._checks import bad_value, refuse
 from geodiff_plugin.capture import NEIGHBOURS, POINTS
+from geodiff_plugin.config import Affects
 from geodiff_plugin.formats.files import check_file, open_image
 from geodiff_plugin.formats.out import OutFolder, free_folder
 from geodiff_plugin.options import (
@@ -19,8 +20,10 @@ from geodiff_plugin.options import (
     FURTHER_VIEWS,
     KNOWN_DEPTHS,
     MACHINES,
+    NOTHING,
     OUTPUT,
     PRIOR,
+    RESULT,
     SEQUENCES,
     UNKNOWN_POSES,
     PriorOptions,
@@ -37,10 +40,11 @@ from geodiff_plugin.options import (
 
 #: What is read of a COLMAP model: texts before binary files.
 MODEL_FILES = (("cameras.txt", "images.txt"), ("cameras.bin", "images.bin"))
-_camera, _output = partial(declare, panel=CAMERAS), partial(declare, panel=OUTPUT)
-_prior, _known = partial(declare, panel=PRIOR), partial(declare, panel=KNOWN_DEPTHS)
-_unposed, _further = partial(declare, panel=UNKNOWN_POSES), partial(declare, panel=FURTHER_VIEWS)
-_sequence, _machines = partial(declare, panel=SEQUENCES), partial(declare, panel=MACHINES)
+_camera, _prior, _known, _unposed, _further, _sequence = (
+    partial(declare, panel=panel, affects=RESULT)
+    for panel in (CAMERAS, PRIOR, KNOWN_DEPTHS, UNKNOWN_POSES, FURTHER_VIEWS, SEQUENCES)
+)
+_output, _machines = (partial(declare, panel=panel, affects=NOTHING) for panel in (OUTPUT, MACHINES))
 PARAMETERS = ("fx", "fy", "cx", "cy", "baseline")
 #: Those that nothing stands in for.
 NEEDED_PARAMETERS = ("fx", "baseline")
@@ -89,6 +93,7 @@ class DepthOptions(SpeedOptions, RunOptions):
         "LEFT,RIGHT[,CALIB] on each line.",
         "",
         metavar="LEFT",
+        affects=RESULT,
     )
     right: Path | None = declare(
         None,
@@ -96,6 +101,7 @@ class DepthOptions(SpeedOptions, RunOptions):
         "views.",
         "",
         metavar="RIGHT",
+        affects=RESULT,
     )
     calib: tuple[Path, ...] = _camera(
         (),
@@ -159,7 +165,9 @@ class DepthOptions(SpeedOptions, RunOptions):
         None, "Confidence of each known depth, 0 to 1, as an array of the same shape."
     )
     side_by_side: bool = _sequence(False, "LEFT is one picture or video with both views, left one first.")
-    steady: bool = _sequence(False, "Average the depth of consecutive frames where they agree.")
+    steady: bool = _sequence(
+        False, "Average the depth of consecutive frames where they agree.", affects=NOTHING
+    )
     topic_left: str | None = _sequence(None, "In a bag: the topic of the left images.", "--left")
     topic_right: str | None = _sequence(None, "In a bag: the topic of the right images.", "--right")
     tolerance: float = _sequence(
@@ -169,6 +177,7 @@ class DepthOptions(SpeedOptions, RunOptions):
         "16UC1",
         "In a bag: depth as 16UC1 (whole millimetres) or 32FC1 (metres).",
         choices=("16UC1", "32FC1"),
+        affects=NOTHING,
     )
     out: Path | None = _output(
         None, "Output folder (default: geodiff-out, with a number if that exists).", "--out", "-o"
@@ -180,14 +189,16 @@ class DepthOptions(SpeedOptions, RunOptions):
         (),
         "Also write glb (point cloud), mesh (textured GLB) or colmap (sparse model); repeatable.",
         choices=("glb", "mesh", "colmap"),
+        affects=RESULT,
     )
     min_confidence: float = _output(
-        0.0, "Leave points of lower confidence out of the cloud, 0 to 1.", low=0, high=1
+        0.0, "Leave points of lower confidence out of the cloud, 0 to 1.", low=0, high=1, affects=RESULT
     )
     into: Path | None = _output(
         None,
         "Also write the depth that another camera sees. A JSON file gives its K, its pose E in the left "
         "camera's frame, width and height.",
+        affects=RESULT,
     )
     strict: bool = _output(False, "Fail unless the result is trusted.")
     quiet: bool = _output(False, "Show no progress bar and no summary.", "--quiet", "-q")
@@ -428,20 +439,29 @@ class CaptureOptions(SpeedOptions, PriorOptions):
         "Metashape or OpenSfM, a sequence of EuRoC, KITTI, TUM RGB-D or ScanNet, a video, or images.",
         "",
         metavar="PATH",
+        affects=Affects.INPUTS,
     )
     out: Path = _output(
         Path("geodiff-capture"), "Output folder, with one folder for each frame.", "--out", "-o"
     )
-    frames: str | None = declare(None, "Frames that get depth: NAME,NAME or FIRST:LAST:STEP (default: all).")
-    neighbours: int = declare(NEIGHBOURS, "Largest number of right views of a frame.", low=1, high=32)
+    frames: str | None = declare(
+        None, "Frames that get depth: NAME,NAME or FIRST:LAST:STEP (default: all).", affects=NOTHING
+    )
+    neighbours: int = declare(
+        NEIGHBOURS, "Largest number of right views of a frame.", low=1, high=32, affects=RESULT
+    )
     poses: str = _camera(
-        "refined", "refined (all solved together) or given (used as they are).", choices=("refined", "given")
+        "refined",
+        "refined (all solved together) or given (used as they are).",
+        choices=("refined", "given"),
+        affects=Affects.POSES,
     )
     points: str = declare(
         "tracks",
         "Known depths: tracks (points of the pose solve), model (points of a COLMAP model), depth (depth "
         "maps of the capture) or none.",
         choices=POINTS,
+        affects=RESULT,
     )
     metres_per_unit: float | None = _camera(None, "Metres per unit of the poses.", above_0="metres")
     known_length: str | None = _camera(
@@ -456,16 +476,25 @@ class CaptureOptions(SpeedOptions, PriorOptions):
         (),
         "Measure the distance between two pixels of a frame, as NAME:X1,Y1,X2,Y2; repeatable.",
     )
-    k: Path | None = _camera(None, "Intrinsics of all frames: a 3x3 matrix as text or .npy.", "--K")
-    fov: float | None = _camera(None, "Horizontal field of view in degrees.")
+    k: Path | None = _camera(
+        None, "Intrinsics of all frames: a 3x3 matrix as text or .npy.", "--K", affects=Affects.INPUTS
+    )
+    fov: float | None = _camera(None, "Horizontal field of view in degrees.", affects=Affects.POSES)
     trajectory: Path | None = _camera(
-        None, "Poses of a video in TUM's form: 'seconds tx ty tz qx qy qz qw' on each line."
+        None,
+        "Poses of a video in TUM's form: 'seconds tx ty tz qx qy qz qw' on each line.",
+        affects=Affects.INPUTS,
     )
     images: Path | None = _camera(
-        None, "Folder of the images that a file of cameras names, where they lie elsewhere.", metavar="DIR"
+        None,
+        "Folder of the images that a file of cameras names, where they lie elsewhere.",
+        metavar="DIR",
+        affects=Affects.INPUTS,
     )
     prior_map: Path | None = _prior(
-        None, "Take another model's depth maps as the prior: a folder with NAME.npy for each frame."
+        None,
+        "Take another model's depth maps as the prior: a folder with NAME.npy for each frame.",
+        affects=Affects.INPUTS,
     )
     export: tuple[str, ...] = _output(
         (),

@@ -12,12 +12,13 @@ from geodiff_plugin import __version__
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.capture.results import clear_frame
+from geodiff_plugin.config import Affects, affected
 from geodiff_plugin.formats.files import find_map
 from geodiff_plugin.formats.layouts import CaptureFrame
 from geodiff_plugin.formats.out import REPORT, write_text
 from geodiff_plugin.jobs.changes import input_change, option_changes
 from geodiff_plugin.jobs.journal import Record, fingerprint
-from geodiff_plugin.jobs.options import OF_SCALE, CaptureOptions
+from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.jobs.report import read_report
 from geodiff_plugin.options import flag_of
 
@@ -25,9 +26,11 @@ from geodiff_plugin.options import flag_of
 RECORD = "made_from.json"
 #: The summary of a run over a capture.
 SUMMARY = "capture.json"
-#: Options that the poses depend on, and beside them the depth of a frame. Files count by their content.
-OF_POSES = ("poses", "fov")
-OF_FRAME = ("neighbours", "points", *OF_SCALE, "prior", "space", "steps", "seed")
+#: Options by which the poses, and the depth of a frame, are made. Files count by their content.
+OF_POSES, OF_FRAME = (
+    [name for name, field in CaptureOptions.__dataclass_fields__.items() if affected(field) is part]
+    for part in (Affects.POSES, Affects.RESULT)
+)
 #: An option that was not typed, as the record has it.
 UNSET = str(None)
 #: What is read of every frame, in words; the first two determine the poses.

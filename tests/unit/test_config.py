@@ -24,6 +24,7 @@ from geodiff_plugin.config import (
     SEARCH_ONLY,
     SECTIONS,
     GuidanceConfig,
+    affected,
     close_names,
     config_from_text,
     knob_lines,
@@ -31,6 +32,7 @@ from geodiff_plugin.config import (
     shown,
     value_of,
 )
+from geodiff_plugin.jobs.options import CaptureOptions, DepthOptions
 
 (PAGE,) = (Path(__file__).resolve().parents[2] / "docs").rglob("knobs.md")
 
@@ -41,6 +43,11 @@ def test_the_default_of_every_knob_is_legal(described):
     assert "|" not in knob["values"]
     assert knob["check"](described.default, described.name) == described.default
     assert bool(knob["unset"]) == (described.default is None)
+
+
+@pytest.mark.parametrize("settings", [GuidanceConfig, DepthOptions, CaptureOptions])
+def test_every_setting_declares_what_becomes_stale_when_it_changes(settings):
+    assert [each.name for each in dataclasses.fields(settings) if affected(each) is None] == []
 
 
 @pytest.mark.parametrize("preset", PRESETS)
