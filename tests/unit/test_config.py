@@ -50,6 +50,39 @@ def test_every_setting_declares_what_becomes_stale_when_it_changes(settings):
     assert [each.name for each in dataclasses.fields(settings) if affected(each) is None] == []
 
 
+#: What each preset changes: S5.1 and Algorithm 1 print it for the paper, the code of Marigold-DC for that.
+CHANGED_BY = {
+    "default": {},
+    "fast": {"sweep_pixels": 80_000, "corrections": 1, "min_steps": 1, "pose": "given"},
+    "paper": {
+        **{"gradient": "full", "rule": "summed", "step_latents": 0.01, "inner_steps": 1, "min_steps": 10},
+        **{"weights": {"photometric": 1.0, "prior_pull": 0.01}, "pyramid_levels": 1, "exposure": False},
+        **{"z_test": False, "min_visible": 0.0, "pull_to": "zero", "search": "one-number", "pose": "given"},
+        **{"sweep_pixels": 442_368, "clean_photographs": False, "correct": False, "crisp": False},
+        "reject_reflections": False,
+    },
+    "marigold-dc": {
+        **{"gradient": "full", "rule": "adam-norm", "step_latents": 0.05, "step_affine": 0.005},
+        **{"inner_steps": 1, "min_steps": 50, "weights": {"points": 1.0}, "points_loss": "l1l2"},
+        **{"positive": "square", "search": "points-range", "step_from": "updated", "even_ensemble": "lower"},
+        **{"ensemble_at": "image", "sweep_pixels": 4_294_967_296, "correct": False, "crisp": False},
+    },
+    "search-only": {"inner_steps": 0, "weights": {"photometric": 1.0}, "correct": False, "crisp": False},
+    "prior-fit": {"inner_steps": 0, "correct": False},
+}
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_preset_changes_what_its_source_prints_and_nothing_else(preset):
+    default, values = DEFAULT.to_dict(), PRESETS[preset].to_dict()
+    assert {name: value for name, value in values.items() if value != default[name]} == CHANGED_BY[preset]
+
+
+def test_the_papers_numbers_that_are_the_defaults_too():
+    assert (PAPER.eta, PAPER.step_affine, PAPER.weights["prior_pull"]) == (0.85, 0.01, 0.01)
+    assert DEFAULT.weights == {"photometric": 1, "matches": 1, "points": 1, "prior_pull": 0.01, "anchor": 1}
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_preset_survives_saving_copying_and_pickling(preset, tmp_path):
     config = PRESETS[preset]

@@ -3,12 +3,16 @@
 import json
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
+from types import UnionType
+from typing import get_args, get_origin, get_type_hints
 
 import pytest
 
 from geodiff_plugin import options as module
 from geodiff_plugin._checks import InputError
+from geodiff_plugin.cli.app import COMMANDS as CLI_COMMANDS
 from geodiff_plugin.config import PRESETS
+from geodiff_plugin.evaluation.options import COMMANDS as EVAL_COMMANDS
 from geodiff_plugin.options import (
     PANELS,
     PriorOptions,
@@ -240,3 +244,24 @@ def test_without_ray_its_extra_is_named_and_other_errors_stay(monkeypatch):
         on_ray("pairs_to_folders")
     monkeypatch.setattr(module, "imported", lambda where: where)
     assert on_ray("pairs_to_folders") == "jobs.cluster.pairs_to_folders"
+
+
+def dataclasses_of_options() -> list[type]:
+    commands = [*CLI_COMMANDS.values(), *EVAL_COMMANDS.values()]
+    return [command.options for command in commands if command.options is not None]
+
+
+@pytest.mark.parametrize("kind", dataclasses_of_options(), ids=lambda kind: kind.__name__)
+def test_the_default_of_every_option_has_its_type_and_its_help_is_a_sentence(kind):
+    hints = get_type_hints(kind)
+    for each in fields(kind):
+        if rules_of(each) is None:
+            continue
+        about = rules_of(each).help
+        assert about.endswith((".", ")", "].")) and " " in about, each.name
+        if each.default is not MISSING:
+            allowed = get_args(hints[each.name]) if get_origin(hints[each.name]) is UnionType else ()
+            allowed = [get_origin(one) or one for one in allowed or (hints[each.name],)]
+            assert isinstance(each.default, tuple(allowed)), f"{each.name}: {each.default!r}"
+            if rules_of(each).choices and isinstance(each.default, str):
+                assert each.default in rules_of(each).choices, each.name

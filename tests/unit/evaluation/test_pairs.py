@@ -84,7 +84,7 @@ def test_changes_are_means_worst_and_paired_differences_to_the_unchanged_preset(
         assert row[4].split()[0] == f"{np.mean([r['capped']['raw']['delta1'] for r in group]):.3f}"
         assert row[6] == f"{np.mean([r['seconds'] for r in group]):.1f}"
         more = np.mean([r["capped"]["raw"]["abs_rel"] - base[r["sample"]] for r in group])
-        assert row[5].split()[0] == ("-" if group is records else f"{more:+.3f}" if more else "-")
+        assert row[5].split()[0] == ("-" if row[0] == "as it is" else f"{more:+.3f}")
 
 
 def test_flatness_halves_and_doubles_every_number_and_names_the_pair_that_moves_most():

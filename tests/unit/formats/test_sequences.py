@@ -340,3 +340,11 @@ def test_plain_image_folders_follow_exif_orientation(tmp_path, folder):
     for file in files:
         file.unlink()
     assert sequences.read_photographs(tmp_path) is None
+
+
+@pytest.mark.parametrize("line", ["1.0 rgb/0.png", "x rgb/1.png 1.0 depth/1.png"])
+def test_a_damaged_list_of_associations_is_named_with_what_it_should_be(tmp_path, line):
+    file = tmp_path / "associations.txt"
+    file.write_text(f"0.5 rgb/0.png 0.5 depth/0.png\n{line}\n")
+    with pytest.raises(InputError, match=r"associations\.txt.*list of seconds and file names, twice a line"):
+        sequences._associated_names(file)

@@ -8,7 +8,7 @@ import pytest
 
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.pose import conventions
-from geodiff_plugin.pose.conventions import find_convention, median_px, residuals_px
+from geodiff_plugin.pose.conventions import Convention, find_convention, median_px, residuals_px
 from geodiff_plugin.pose.reconstruction import Match
 from tests.unit.pose.posed_scene import camera, pose, projected
 
@@ -145,3 +145,7 @@ def test_another_convention_must_halve_the_misfit(gain, turned, monkeypatch):
         monkeypatch.setattr(conventions, "_misfit", lambda *_, left=answers: next(left))
         found = find_convention(E, KS, matches(count=20))
         assert (found.name, found.quarters, found.turned_deg) == (*expected, (0, 90, 180)[expected[1]])
+
+
+def test_poses_read_as_they_are_written_are_not_turned():
+    assert Convention("as written", np.eye(4)[None]).turned_deg == 0

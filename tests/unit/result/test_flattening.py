@@ -171,3 +171,19 @@ def test_a_map_of_64_bits_stays_one():
     matches = Matches(0.5 * whole, whole, torch.tensor([0.01]), 9.0 * whole)
     flat = flatten(depth_m, matches, torch.rand(1, 3, *LEFT), torch.full((1, 1, 1, 1), 0.2), depth_m)
     assert flat.dtype == torch.float64
+
+
+def test_a_wall_whose_values_weigh_more_ends_at_smaller_steps_but_not_at_details():
+    """A step of depth cuts links the more, the larger the weight; below ``DETAIL_EDGE`` that makes no difference."""
+    log_depth = torch.zeros(1, 1, 12, 64)
+    log_depth[..., 32:] = 0.05
+    left_01 = torch.full((1, 3, 12, 64), 0.5)
+    denoised = torch.ones_like(log_depth)
+
+    def link_at_step(good: float) -> float:
+        across, _ = flattening._links_of_walls(log_depth, denoised, left_01, torch.full_like(log_depth, good))
+        return float(across[0, 0, 5, 31] / across[0, 0, 5, 10])
+
+    weak, plain, strong = link_at_step(0.25), link_at_step(1.0), link_at_step(4.0)
+    assert weak > plain > strong
+    assert link_at_step(1e6) == pytest.approx(link_at_step(1e8))

@@ -1,0 +1,342 @@
+"""What methods hand to pipelines, guidance, sweeps and matchers, and how they read back what these answer."""
+
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from geodiff_plugin.config import DEFAULT, FAST, PAPER, PRIOR_FIT
+from geodiff_plugin.evaluation import baselines
+from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS, NotApplicable, PriorCache, Settings, find_method
+from geodiff_plugin.evaluation.baselines import guided, method, unguided
+from geodiff_plugin.evaluation.datasets import SampleRef
+from geodiff_plugin.evaluation.datasets.sample import ExtraView, make_sample
+from geodiff_plugin.evidence.guidance import GeometryGuidance
+from geodiff_plugin.types import Rig
+
+SIZE = (40, 56)
+
+
+def make(further=2, **changes):
+    """Three or four views with cameras of their own."""
+    rng = np.random.default_rng(0)
+
+    def image(height, width):
+        return rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+    def camera(f, cx):
+        return np.array([[f, 0, cx], [0, f + 3, 19.0], [0, 0, 1]])
+
+    def pose(x, y=0.0):
+        E = np.eye(4)
+        E[:2, 3] = x, y
+        return E
+
+    views = tuple(ExtraView(image(36 + i, 50), camera(42 + i, 24), pose(0.3, 0.1 * (i + 1))) for i in range(further))
+    rig = Rig(camera(50, 27), camera(50, 29.5), pose(0.2))
+    depth = rng.uniform(1, 4, SIZE)
+    sample = make_sample(SampleRef("d", "s", {}), (image(*SIZE), image(*SIZE)), rig, depth, {}, extra_views=views)
+    return replace(sample, **changes)
+
+
+def test_a_call_has_members_and_a_seeded_generator_and_only_what_was_chosen():
+    call = guided.call_arguments(Settings(seed=5, ensemble=3))
+    assert set(call) == {"ensemble_size", "generator"} and call["ensemble_size"] == 3
+    assert call["generator"].initial_seed() == 5
+    call = guided.call_arguments(Settings(steps=7, resolution=0))
+    assert call["num_inference_steps"] == 7 and call["processing_resolution"] == 0
+
+
+def test_views_are_at_most_as_many_as_asked_with_the_left_pose_first():
+    sample = make()
+    right, K, E = guided.posed_views(sample, 2)
+    assert right is sample.right and K == (sample.K_left, sample.K_right) and E is sample.E
+    for views in (3, 4, 9):
+        images, Ks, Es = guided.posed_views(sample, views)
+        more = sample.extra_views[: views - 2]
+        assert [id(i) for i in images] == [id(sample.right), *(id(v.image) for v in more)]
+        assert [id(k) for k in Ks] == [id(sample.K_left), id(sample.K_right), *(id(v.K) for v in more)]
+        assert np.array_equal(Es[0], np.eye(4)) and Es[1] is sample.E
+        assert [id(e) for e in Es[2:]] == [id(v.E) for v in more]
+    assert guided.posed_views(make(0), 5)[0] is not None
+
+
+class Spy:
+    """A pipeline that keeps its calls and answers with numbered maps."""
+
+    default_processing_resolution, default_denoising_steps, dtype = 48, 6, torch.float32
+
+    def __init__(self, **answer):
+        self.calls, self.answer = [], answer
+
+    def __call__(self, image, **call):
+        self.calls.append((image, call))
+        maps = np.arange(1, 1 + np.prod(SIZE), dtype=float).reshape(1, *SIZE, 1)
+        given = {"prediction": maps, "uncertainty": None, "confidence": None, "warnings": (), "poses": ()}
+        given |= {"scale": None, "shift": None, "global_scale": None, "visible": None}
+        return SimpleNamespace(**given | self.answer)
+
+
+@pytest.fixture
+def spied(monkeypatch):
+    """A spy in place of every prior, whose map is affine in log depth."""
+    adapter = SimpleNamespace(space="log", network_input=slice(0, 4))
+    monkeypatch.setattr(guided, "prior_of", lambda pipe: adapter)
+    spy, asked = Spy(), []
+    evidence = SimpleNamespace()
+    priors = SimpleNamespace(evidence=evidence, get=lambda settings: asked.append(settings) or spy)
+    return SimpleNamespace(spy=spy, asked=asked, priors=priors, adapter=adapter)
+
+
+def test_a_guided_answer_is_the_first_maps_with_notes_of_every_number(spied):
+    maps = {name: np.full((1, *SIZE, 1), v) for name, v in (("uncertainty", 0.3), ("confidence", 0.7))}
+    pose = SimpleNamespace(status="refined", residual_px_given=(1.23456, 2.0), residual_px=(0.5, 0.25))
+    numbers = {"scale": torch.tensor([[1.23456789]]), "shift": torch.tensor([[-0.5, 0.5]])}
+    visible = np.array([True, True, False])
+    spied.spy.answer = maps | numbers | {"poses": (pose, None), "visible": visible, "warnings": ("said",)}
+    call = {"ensemble_size": 2, "processing_resolution": 32}
+    found = guided.guided_prediction(spied.spy, make(), "guidance", call)
+    ((image, given),) = spied.spy.calls
+    assert given == call | {"guidance": "guidance", "output_uncertainty": True}
+    assert np.array_equal(image, make().left) and found.depth_m.shape == SIZE and found.relative is None
+    assert found.depth_m[0, 1] == 2 and (found.space, found.uncertainty[3, 4], found.confidence[2, 2]) == ("log", 0.3, 0.7)
+    assert found.notes == {
+        **{"warnings": ["said"], "scale": [1.234568], "shift": [-0.5, 0.5], "pose": "refined"},
+        **{"residual_px_given": [1.235, 2.0], "residual_px": [0.5, 0.25], "visible": 0.6667},
+    }
+    spied.spy.answer = {"global_scale": torch.tensor([2.5])}
+    plain = guided.guided_prediction(spied.spy, make(), "guidance", {"ensemble_size": 1})
+    assert plain.uncertainty is plain.confidence is None
+    assert plain.notes == {"warnings": [], "global_scale": [2.5]}
+    assert spied.spy.calls[1][1]["output_uncertainty"] is False
+
+
+def test_guidance_has_the_views_the_shared_evidence_and_what_is_known_of_the_baseline(spied):
+    sample = make()
+    made = guided._guidance(sample, Settings(views=3), spied.priors, GeometryGuidance, crisp=False)
+    assert made.evidence_store is spied.priors.evidence and made.measured_baseline is False
+    assert made.config == DEFAULT.changed(crisp=False) and len(made.inputs[0].views) == 2
+    perturbed = replace(sample, E_true=sample.E)
+    assert guided._guidance(perturbed, Settings(), spied.priors, GeometryGuidance).measured_baseline is True
+    two = guided._guidance(sample, Settings(views=2), spied.priors, GeometryGuidance)
+    assert len(two.inputs[0].views) == 1
+
+
+def test_presets_are_those_of_their_names(spied):
+    sample, known = make(), {"paper": PAPER, "prior-fit": PRIOR_FIT, "guided": DEFAULT, "fast": FAST}
+    for name, config in known.items():
+        spied.spy.calls.clear()
+        METHODS[name].run(sample, Settings(steps=2, seed=4), spied.priors)
+        ((_, call),) = spied.spy.calls
+        assert call["guidance"].config == config and call["num_inference_steps"] == 2
+        assert call["generator"].initial_seed() == 4
+    METHODS["scale-shift-only"].run(sample, Settings(), spied.priors)
+    config = spied.spy.calls[-1][1]["guidance"].config
+    assert config == DEFAULT.changed(optimize_latents=False, crisp=False)
+    find_method("paper:inner_steps=3+g_s_range=[2,5]").run(sample, Settings(), spied.priors)
+    assert spied.spy.calls[-1][1]["guidance"].config == PAPER.changed(inner_steps=3, g_s_range=(2.0, 5.0))
+    assert spied.asked[-1] == Settings()
+    spied.adapter.network_input = None
+    with pytest.raises(NotApplicable):
+        METHODS["paper"].run(sample, Settings(), spied.priors)
+    METHODS["guided"].run(sample, Settings(), spied.priors)
+
+
+def test_a_plain_call_is_relative_in_the_priors_space(spied):
+    found = METHODS["prior-aligned"].run(make(), Settings(ensemble=3), spied.priors)
+    assert found.depth_m is None and found.relative[0, 4] == 5 and found.space == "log"
+    assert "guidance" not in spied.spy.calls[0][1] and spied.spy.calls[0][1]["ensemble_size"] == 3
+
+
+def test_reprojection_guides_the_plain_map_at_the_priors_resolution(spied, monkeypatch):
+    handed = []
+    monkeypatch.setattr(guided, "guided_map", lambda *given: handed.append(given))
+    METHODS["reprojection-only"].run(make(), Settings(), spied.priors)
+    METHODS["reprojection-only"].run(make(), Settings(resolution=32), spied.priors)
+    for (values, space, _, settings, _, preset), resolution in zip(handed, (48, 32), strict=True):
+        assert values[0, 1] == 2 and values.shape == SIZE and space == "log"
+        assert settings == Settings(resolution=resolution)
+        config = preset(*guided.posed_views(make(), 2)).config
+        assert (config.inner_steps, config.step_latents, config.min_steps) == (50, 0.01, 1)
+        assert dict(config.weights) == dict(PAPER.weights) and not config.correct and not config.crisp
+    assert all(call["match_input_resolution"] is False for _, call in spied.spy.calls)
+
+
+def test_a_map_is_guided_once_by_the_prior_for_maps(spied):
+    values = np.ones((4, 5))
+    settings = Settings(steps=9, ensemble=4, seed=3, resolution=64)
+    guided.guided_map(values, "disparity", make(), settings, spied.priors, GeometryGuidance)
+    assert spied.asked == [replace(settings, prior="map", space="disparity")]
+    ((_, call),) = spied.spy.calls
+    assert call["depth_map"] is values and call["ensemble_size"] == 1 and "num_inference_steps" not in call
+    assert call["processing_resolution"] == 64 and call["generator"].initial_seed() == 3
+
+
+@pytest.mark.parametrize(("space", "top"), [("depth", 1.0), ("disparity", 0.0), ("log", 1.0)])
+def test_a_ramp_is_far_at_the_top_and_near_at_the_bottom(space, top):
+    made = []
+    ramp = SimpleNamespace(adapter=SimpleNamespace(space=space, encode=lambda x: made.append(x) or x))
+    condition = guided.RampPrior.prepare_condition(ramp, torch.zeros(2, 3, 5, 7), 1, 1, None)
+    rows = torch.linspace(top, 1 - top, 5)[None, None, :, None].expand(2, 1, 5, 7)
+    torch.testing.assert_close(condition["image_latent"], rows)
+    assert list(condition) == ["image_latent"] and made[0] is condition["image_latent"]
+
+
+def test_withheld_poses_keep_images_cameras_and_the_length_of_the_baseline(spied, monkeypatch):
+    sample, asked = make(), []
+
+    def from_photographs(images, **given):
+        asked.append((images, given))
+        if given["K"][0][0, 0] == 99:
+            raise ValueError("too few matches")
+        return "guidance"
+
+    monkeypatch.setattr(guided.GeometryGuidance, "from_photographs", from_photographs)
+    run = find_method("guided:pose=estimated").run
+    run(sample, Settings(views=3), spied.priors)
+    images, given = asked[0]
+    assert [id(i) for i in images] == [id(i) for i in (sample.left, sample.right, sample.extra_views[0].image)]
+    assert [id(k) for k in given["K"]] == [id(k) for k in (sample.K_left, sample.K_right, sample.extra_views[0].K)]
+    assert given["baseline_m"] == pytest.approx(0.2) and spied.spy.calls[0][1]["guidance"] == "guidance"
+    run(sample, Settings(), spied.priors)
+    assert len(asked[1][0]) == len(asked[1][1]["K"]) == 2
+    wrong = replace(sample, K_left=sample.K_left * 99 / 50)
+    with pytest.raises(NotApplicable, match=r"no pose could be estimated \(too few matches\)"):
+        run(wrong, Settings(), spied.priors)
+
+
+def test_configurations_hold_every_setting_that_changes_a_result():
+    settings = Settings(prior="x", graphs=True, no_kernels=True, seed=3)
+    plain = METHODS["prior-aligned"].configuration(settings)
+    free = {"prior", "graphs", "no_kernels"}
+    assert set(plain) == {f.name for f in fields(Settings)} - free and plain["seed"] == 3
+    default = METHODS["guided"].configuration(settings)
+    assert set(default) == set(plain) | {"guidance"}
+    others = {str(METHODS[n].configuration(settings)["guidance"]) for n in ("guided", "fast", "paper", "prior-fit")}
+    assert len(others) == 4
+    sweeps = METHODS["sweep-sgm"].configuration
+    assert sweeps(Settings(views=3)) != sweeps(Settings()) != sweeps(Settings(device="cuda"))
+
+
+def test_names_bind_priors_and_seeds():
+    bound = find_method("guided:pose=estimated@org/some-prior/#12")
+    assert (bound.prior, bound.seed, bound.base_name) == ("org/some-prior/", 12, "guided:pose=estimated")
+    assert bound.title == "guided, poses estimated (some-prior), seed 12"
+    assert bound.adapted(Settings(prior="y", seed=1)) == Settings(prior="org/some-prior/", seed=12)
+    assert find_method("guided").adapted(Settings(prior="y", seed=1)) == Settings(prior="y", seed=1)
+    zero = find_method("paper#0")
+    assert (zero.seed, zero.base_name, zero.adapted(Settings(seed=4)).seed) == (0, "paper", 0)
+    assert find_method("guided:rule=sgd+inner_steps=2").title == "guided, rule=sgd, inner_steps=2"
+    assert list(FAMILIES) == ["guided", "paper", "hf", "files", "prior-map"]
+    assert [m for m in METHODS if METHODS[m].uses_prior] == list(METHODS)[: len(guided.GUIDED_METHODS)]
+    for name in ("guided@", "sgbm#1", "sgbm@x", "nothing", "guided#x"):
+        with pytest.raises(ValueError, match="methods must be"):
+            find_method(name)
+
+
+def test_a_cache_loads_a_prior_once_for_each_choice(monkeypatch):
+    loaded, enabled = [], []
+
+    def load_prior(name, **told):
+        loaded.append((name, told))
+        return SimpleNamespace(set_progress_bar_config=lambda disable: enabled.append(disable))
+
+    monkeypatch.setattr(method, "load_prior", load_prior)
+    monkeypatch.setattr(method, "enable_geometry_guidance", lambda pipe, **speed: enabled.append(speed) or object())
+    cache, first = PriorCache(), Settings()
+    pipe = cache.get(first)
+    assert cache.get(replace(first, seed=3, steps=2, ensemble=5, views=4, resolution=9)) is pipe
+    assert loaded == [("bundled", {"device": "cpu", "dtype": torch.float32})]
+    assert enabled == [True, {"graphs": False, "kernels": True}]
+    changes = ({"prior": "x"}, {"device": "cuda"}, {"dtype": "bfloat16"}, {"space": "log"})
+    changes = (*changes, {"graphs": True}, {"no_kernels": True})
+    pipes = {id(cache.get(replace(first, **change))) for change in changes}
+    assert len(pipes | {id(pipe)}) == 7 == len(loaded)
+    assert loaded[3][1] == {"device": "cpu", "dtype": torch.bfloat16} and loaded[4][1]["space"] == "log"
+    assert enabled[-3] == {"graphs": True, "kernels": True} and enabled[-1] == {"graphs": False, "kernels": False}
+
+
+def test_fingerprints_change_with_weights_shapes_and_configs():
+    def pipe(value=1.0, name="weight", **config):
+        module = torch.nn.Linear(3, 2, bias=False)
+        module.weight.data = torch.full((2, 3), value) if name == "weight" else torch.full((3, 2), value)
+        module.config = {"a": 1, "_where": id(module)}
+        made = type("Pipe", (), {})()
+        made.components, made.config = {"unet": module, "none": None}, {"space": "log"} | config
+        return made
+
+    first = method._fingerprint(pipe())
+    assert len(first) == 16 and first == method._fingerprint(pipe(_name="elsewhere"))
+    others = [pipe(2.0), pipe(name="transposed"), pipe(space="depth"), pipe(size=3)]
+    assert len({first, *map(method._fingerprint, others)}) == 5
+
+
+def test_a_sweep_has_as_many_right_views_as_asked_and_finds_a_wall():
+    height, width, shift = 48, 64, 4
+    wide = np.random.default_rng(1).integers(0, 256, (height, width + shift, 3), dtype=np.uint8)
+    K, E = np.array([[40.0, 0, 31.5], [0, 40.0, 23.5], [0, 0, 1]]), np.eye(4)
+    E[0, 3] = 0.2  # the wall is 2 m away
+    images = wide[:, :width], wide[:, shift:]
+    sample = make_sample(SampleRef("d", "s", {}), images, Rig(K, K, E), np.full((height, width), 2.0), {})
+    found = METHODS["sweep-sgm"].run(sample, Settings(), PriorCache())
+    assert found.space == "disparity" and found.depth_m.shape == (height, width)
+    np.testing.assert_allclose(found.depth_m[8:-8, 12:-8], 2.0, rtol=0.05)
+    assert 0.7 < found.notes["density"] <= 1
+    away = np.linalg.inv(E)
+    more = replace(sample, extra_views=(ExtraView(wide[:, :width], K, away),))
+    assert [len(unguided.sweep(more, "cpu", views).aligned) for views in (2, 3, 9)] == [1, 2, 2]
+
+
+def test_models_of_transformers_are_asked_for_the_left_image_in_its_size():
+    sample, asked, predicted = make(), [], []
+
+    def predict(left_01, size):
+        predicted.append((left_01, size))
+        return torch.arange(float(np.prod(SIZE))).reshape(1, 1, *SIZE)
+
+    model = SimpleNamespace(predict=predict, metres=lambda v: 2 * v, metric=True)
+    model.config = SimpleNamespace(prediction_type="disparity")
+    priors = SimpleNamespace(get=lambda settings: asked.append(settings) or model)
+    hf = find_method("hf:org/some-model")
+    found = hf.run(sample, Settings(prior="x", space="log", dtype="float16"), priors)
+    assert asked == [Settings(prior="transformers:org/some-model", dtype="float16")]
+    np.testing.assert_allclose(predicted[0][0][0].permute(1, 2, 0) * 255, sample.left, atol=1e-3)
+    assert predicted[0][1] == SIZE and found.space == "disparity"
+    assert found.relative[0, 2] == 2 and found.depth_m[0, 2] == 4
+    model.metric = False
+    assert hf.run(sample, Settings(), priors).depth_m is None
+    assert hf.configuration(Settings(device="cuda", dtype="float16")) == {"device": "cuda", "dtype": "float16", "files": ""}
+    assert (hf.title, hf.uses_prior) == ("some-model", False)
+
+
+@pytest.mark.parametrize(("kind", "space"), [("relative-disparity", "disparity"), ("depth", "depth")])
+def test_maps_of_a_folder_become_a_prior(tmp_path, monkeypatch, kind, space):
+    handed = []
+    monkeypatch.setattr(unguided, "guided_map", lambda *given: handed.append(given))
+    values = np.linspace(1, 2, 12).reshape(3, 4)
+    np.save(tmp_path / "d_s.npy", values)
+    name = f"prior-map:{kind}:{tmp_path}"
+    own = find_method(name)
+    own.run(make(), Settings(seed=2), "priors")
+    np.testing.assert_array_equal(handed[0][0], values)
+    assert handed[0][1] == space and handed[0][3:] == (Settings(seed=2), "priors", GeometryGuidance)
+    assert own.title == f"guided {tmp_path.name}" and not own.uses_prior and own.name == name
+    guided_too = own.configuration(Settings())
+    plain = find_method(f"files:{kind}:{tmp_path}").configuration(Settings())
+    assert {k: guided_too[k] for k in plain} == plain and "guidance" in guided_too and plain["kind"] == kind
+    (tmp_path / "d_s.npy").unlink()
+    with pytest.raises(NotApplicable, match="no map in the folder"):
+        own.run(make(), Settings(), "priors")
+
+
+def test_relative_maps_may_be_negative_and_png_has_holes_of_0(tmp_path):
+    values = np.array([[-1.0, 0.0, 2.0], [np.inf, np.nan, 3.0]])
+    np.save(tmp_path / "m.npy", values)
+    read = partial(unguided._read, tmp_path / "m.npy")
+    np.testing.assert_array_equal(read("relative-depth"), [[-1, 0, 2], [np.nan, np.nan, 3]])
+    np.testing.assert_array_equal(read("disparity"), [[np.nan, np.nan, 2], [np.nan, np.nan, 3]])
+    assert Path(tmp_path / "m.npy").is_file() and baselines.FAMILIES["files"] is unguided.files_method
