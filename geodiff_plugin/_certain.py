@@ -1,4 +1,4 @@
-"""What of an estimate is certain."""
+"""Robust statistics: which part of an estimate is certain, and the spread that a median stands for."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import math
 
 #: So many standard errors of an estimate are not counted.
 UNCERTAIN = 4.0
+#: Standard deviation of normally distributed values per median absolute deviation.
+SD_PER_MAD = 1.4826
 
 
 def certain_part(value: float, error: float) -> float:

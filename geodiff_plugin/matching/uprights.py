@@ -14,7 +14,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from geodiff_plugin._certain import certain_part
+from geodiff_plugin._certain import SD_PER_MAD, certain_part
 
 #: Shortest line, as a share of the picture's height.
 SHORTEST = 0.06
@@ -76,7 +76,7 @@ def _fit_lines(at: np.ndarray, values: np.ndarray, known: np.ndarray) -> _Fits:
         slope = (total * moments - first * sums) / determinant
         middle = (second * sums - first * moments) / determinant
         off = values - middle[:, None] - slope[:, None] * away
-        scale = np.maximum(1.4826 * _median(np.abs(off), known), 1e-6)
+        scale = np.maximum(SD_PER_MAD * _median(np.abs(off), known), 1e-6)
         weight = known / (1.0 + (off / (2.0 * scale[:, None])) ** 2)
     return _Fits(slope, middle, off, scale)
 

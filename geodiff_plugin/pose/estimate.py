@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from geodiff_plugin._certain import SD_PER_MAD
 from geodiff_plugin._checks import bad_value, check_number
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.solve import FREE_PX, SCALE_PX, PosePrior, solve_poses
@@ -288,7 +289,7 @@ def _point_at(
         bad_value("known length", "near matched points", got, cure)
     w = inverse_depth[near]
     middle = float(np.median(w))
-    spread = 1.4826 * float(np.median(np.abs(w / middle - 1)))
+    spread = SD_PER_MAD * float(np.median(np.abs(w / middle - 1)))
     ray = np.linalg.solve(tracks.K_left, (*px, 1.0))
     return ray / middle, spread
 
@@ -342,5 +343,5 @@ def _by_points(tracks: Tracks, inverse_depth: np.ndarray, points: np.ndarray) ->
         bad_value("points", "with at least 5 near matched points", f"{int(close.sum())}")
     ratios = ahead[close, 2] * inverse_depth[nearest[close]]
     factor = float(np.median(ratios))
-    spread = 1.4826 * float(np.median(np.abs(ratios / factor - 1))) / np.sqrt(close.sum())
+    spread = SD_PER_MAD * float(np.median(np.abs(ratios / factor - 1))) / np.sqrt(close.sum())
     return Scale("points", factor, spread)

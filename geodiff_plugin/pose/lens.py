@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geodiff_plugin._certain import certain_part
+from geodiff_plugin._certain import SD_PER_MAD, certain_part
 from geodiff_plugin.pose.tracks import FEWEST, TINY, Tracks, blocks, epipolar
 
 #: Matches further off their epipolar lines than this are wrong, pixels.
@@ -129,7 +129,7 @@ def _fit_k1(tracks: Tracks, T: np.ndarray, explained: np.ndarray) -> tuple[float
         A[:, 0] = (ahead - behind) / (2 * STEP_K1)
         centred = off - explained @ others
         centred = centred - np.median(centred)
-        scale = max(1.4826 * float(np.median(np.abs(centred))), 0.1)
+        scale = max(SD_PER_MAD * float(np.median(np.abs(centred))), 0.1)
         weight = 1.0 / (1.0 + (centred / (2.0 * scale)) ** 2)
         weighted = A * weight[:, None]
         H = weighted.T @ A + 1e-9 * np.eye(A.shape[1])

@@ -20,6 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._certain import SD_PER_MAD
 from geodiff_plugin._threads import available_cores
 from geodiff_plugin.geometry import plane_rays, project_rays
 from geodiff_plugin.matching.build import pilot_volume
@@ -279,7 +280,7 @@ def split_residuals(tracks: Tracks, T: np.ndarray) -> SharedErrors:
     independent residuals has ``1 / n`` of their variance. ``T (4, 4)`` fits tracks of one right view.
     """
     off = epipolar(tracks, T).off_px
-    scale = max(1.4826 * float(np.median(np.abs(off))), 1e-3)
+    scale = max(SD_PER_MAD * float(np.median(np.abs(off))), 1e-3)
     kept = np.abs(off) < 3.0 * scale
     block = blocks(tracks.kept(kept))
     count = np.bincount(block)

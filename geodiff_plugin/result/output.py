@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from geodiff_plugin._certain import SD_PER_MAD
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.estimate import NO_UNIT
@@ -114,7 +115,7 @@ def to_host(*groups: Mapping[str, Tensor | None]) -> list[dict[str, Tensor | Non
 def _in_the_priors_metres(output: MetricDepthOutput, over_prior: Tensor) -> MetricDepthOutput:
     """Convert an output without a unit to the metres of a metric prior."""
     factor = 1.0 / float(over_prior.median())
-    spread = 1.4826 * float((over_prior * factor).clamp_min(1e-9).log().abs().median())
+    spread = SD_PER_MAD * float((over_prior * factor).clamp_min(1e-9).log().abs().median())
 
     def moved(E: np.ndarray) -> np.ndarray:
         return np.block([[E[:3, :3], factor * E[:3, 3:]], [E[3:]]])

@@ -7,6 +7,7 @@ from statistics import NormalDist
 
 import numpy as np
 
+from geodiff_plugin._certain import SD_PER_MAD
 from geodiff_plugin._checks import bad_value
 
 #: ``confidence`` is the probability that a depth is within this share of the truth.
@@ -15,8 +16,6 @@ CONFIDENT_WITHIN = 0.1
 LEAST_CONFIDENCE = 0.05
 #: Nor does a higher one than this.
 MOST_CONFIDENCE = 0.999
-#: From the median absolute deviation to the standard deviation of a normal distribution.
-SD_OF_MAD = 1.4826
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ def _spread(confidence: float | None, uncertainty_m: float | None, depth_m: floa
         # A normal error that is within 10 % with this probability has this standard deviation.
         spreads.append(CONFIDENT_WITHIN / NormalDist().inv_cdf((1 + bounded) / 2))
     if uncertainty_m is not None:
-        spreads.append(SD_OF_MAD * uncertainty_m / depth_m)
+        spreads.append(SD_PER_MAD * uncertainty_m / depth_m)
     return max(spreads, default=None)
 
 

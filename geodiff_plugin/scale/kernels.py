@@ -12,6 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from geodiff_plugin._certain import SD_PER_MAD
 from geodiff_plugin._kernels import launched_on
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale import points
@@ -19,6 +20,7 @@ from geodiff_plugin.scale.space import FLOOR_EPS, KERNEL_FORMS, SQUARE, AffineSt
 
 # A kernel reads constants of its module only as these.
 _FIT_NOISE = tl.constexpr(points.FIT_NOISE)
+_SD_PER_MAD = tl.constexpr(SD_PER_MAD)
 _FIT_FLOOR = tl.constexpr(points.FIT_FLOOR)
 _FIT_CAUCHY = tl.constexpr(points.FIT_CAUCHY)
 _REFERENCE_DOUBT = tl.constexpr(points.REFERENCE_DOUBT)
@@ -298,8 +300,8 @@ def refine_kernel(
         _store_residuals(values, inverse_at, noise, e0, e1, size, count, FORM, CHUNK)
         median = _weighted_median(size, confidence, count, BLOCK)
         n00, n01, n11, g0, g1 = _normal_equations(
-            values, inverse_at, confidence, deviation, noise, e0, e1, tl.maximum(1.4826 * median, _FIT_FLOOR),
-            count, _FIT_CAUCHY, FORM, CHUNK,
+            values, inverse_at, confidence, deviation, noise, e0, e1,
+            tl.maximum(median * _SD_PER_MAD, _FIT_FLOOR), count, _FIT_CAUCHY, FORM, CHUNK,
         )  # fmt: skip
         damping = 1e-12 * (n00 + n11) + 1e-20
         a00, a11 = n00 + 1e-4 * n00 + damping, n11 + 1e-4 * n11 + damping

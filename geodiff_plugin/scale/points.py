@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from geodiff_plugin._certain import SD_PER_MAD
 from geodiff_plugin._kernels import use_kernel
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.matching.matches import UNIT, read_above
@@ -204,7 +205,7 @@ def _refine_once(
     above = mapped + noise
     residual = ((inverse + noise) / above).log().clamp(-1.0, 1.0)
     slope = mapped / above * (log_depth(v + h) - log_depth(v - h)) / (2.0 * h)
-    left_over = 1.4826 * weighted_quantile(residual.abs(), confidence.expand_as(residual), 0.5)
+    left_over = SD_PER_MAD * weighted_quantile(residual.abs(), confidence.expand_as(residual), 0.5)
     floor = left_over.clamp_min(FIT_FLOOR)[:, None]
     variance = (deviation * noise / above) ** 2 + floor**2
     weight = confidence / (variance * (1.0 + residual**2 / (FIT_CAUCHY**2 * variance)))

@@ -174,7 +174,7 @@ def test_a_map_of_64_bits_stays_one():
 
 
 def test_a_wall_whose_values_weigh_more_ends_at_smaller_steps_but_not_at_details():
-    """A step of depth cuts links the more, the larger the weight; below ``DETAIL_EDGE`` that makes no difference."""
+    """A step of depth cuts links the more, the larger the weight, down to steps of ``DETAIL_EDGE``."""
     log_depth = torch.zeros(1, 1, 12, 64)
     log_depth[..., 32:] = 0.05
     left_01 = torch.full((1, 3, 12, 64), 0.5)
