@@ -8,6 +8,9 @@ import math
 UNCERTAIN = 4.0
 #: Standard deviation of normally distributed values per median absolute deviation.
 SD_PER_MAD = 1.4826
+#: A scale whose relative standard deviation is larger is not trusted, whether it comes from a refined pose,
+#: from a solved capture or from a known length.
+MAX_SCALE_SPREAD = 0.1
 
 
 def certain_part(value: float, error: float) -> float:

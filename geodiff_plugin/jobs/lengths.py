@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from geodiff_plugin._certain import MAX_SCALE_SPREAD
 from geodiff_plugin._checks import bad_value, check_positive
 from geodiff_plugin.capture.frames import Capture
 from geodiff_plugin.capture.results import AGREED
@@ -18,9 +19,6 @@ from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.messages import Message
 from geodiff_plugin.result.readings import Reading, distance_m, metres, read_pixel
 
-#: A known length that is measured less exactly than this in the depth of its frame sets no scale to trust: as
-#: of a refined pose (``result.verdict.MOST_SCALE_SPREAD``).
-MOST_SPREAD = 0.1
 #: How the options are typed.
 KNOWN_LENGTH = "NAME:X1,Y1,X2,Y2,METRES"
 DISTANCE = "NAME,NAME,METRES"
@@ -132,7 +130,7 @@ def known_scale(capture: Capture, options: CaptureOptions, maps_of: MapsOf) -> K
     if not measured > 0:
         bad_value("--known-length", "between two different places", repr(options.known_length))
     relative = math.inf if spread is None else spread / measured
-    doubt = _doubt(span.frame, relative) if relative > MOST_SPREAD else None
+    doubt = _doubt(span.frame, relative) if relative > MAX_SCALE_SPREAD else None
     return KnownScale(length / measured, relative if math.isfinite(relative) else 1.0, doubt)
 
 

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from geodiff_plugin._certain import MAX_SCALE_SPREAD
 from geodiff_plugin._checks import bad_value
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.conventions import find_convention, median_px, noted_convention, residuals_px
@@ -47,8 +48,6 @@ SCALE_FLOOR_TRAJECTORY = 0.02
 SCALE_FLOOR_DEPTH = 0.015
 #: Both scales are called in disagreement beyond this.
 DISAGREES = 0.1
-#: A scale that is less certain than this is not trusted, as that of a refined pose of one pair.
-MOST_SCALE_SPREAD = 0.1
 #: A given position is reported as wrong if the solve moves it this many times as far as the median one.
 FAR_TIMES = 10.0
 #: It also moves it by this share of the size of the trajectory, so that exact poses are not reported.
@@ -351,7 +350,7 @@ def _noted(result: SolvedCapture, notes: list[Message], names: Sequence[str]) ->
             f"{100 * abs(ratio - 1):.0f} % apart; their mean is used. Give --known-length for an exact one."
         )
         notes.append(Message("capture.scales", sentence))
-    if spread > MOST_SCALE_SPREAD:
+    if spread > MAX_SCALE_SPREAD:
         sentence = f"The scale is uncertain by {100 * spread:.0f} %: give --known-length for an exact one."
         notes.append(Message("capture.scale", sentence))
     if result.status == "solved" and result.E_given is not None:

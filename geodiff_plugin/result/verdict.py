@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from geodiff_plugin._camera_checks import LONG_BASELINE_M
+from geodiff_plugin._certain import MAX_SCALE_SPREAD
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.refine import MOST_DEPTH_SPREAD
 from geodiff_plugin.result.indicators import POINTS_WRONG
@@ -92,11 +93,10 @@ MOST_MOVED = 0.15
 #: A larger shear of the right picture along its rows, in shares of its width, is not trusted: what is certain
 #: of it was 0 for 38 right pairs of parallel cameras, and .0048 to .021 for 9 of 14 with a shear of .023.
 MOST_SHEAR = 0.005
-#: A refined pose whose scale is less certain than this is not trusted, unless known depths give the scale.
-MOST_SCALE_SPREAD = 0.1
-#: Nor is one whose scale and shape are within their limits, but together above this: the root of the sum of
-#: the squares of their shares of these. It was up to 1.10 for 50 pairs of trackers whose poses were refined,
-#: and 1.21 where the refinement hid that K was of an image .67 times as large.
+#: A refined pose whose scale spreads by more than ``MAX_SCALE_SPREAD`` is not trusted, unless known depths give
+#: the scale. Nor is one whose scale and shape are within their limits, but together above this: the root of
+#: the sum of the squares of their ratios to these. It was up to 1.10 for 50 pairs of trackers whose poses were
+#: refined, and 1.21 where the refinement hid that K was of an image .67 times as large.
 MOST_TOGETHER = 1.15
 #: Known depths that fix a scale and a shift, and show when one of them is wrong.
 LEAST_POINTS = 3
@@ -246,14 +246,14 @@ def _other_centre(found: Indicators) -> bool:
 
 
 def _scale_uncertain(found: Indicators) -> bool:
-    return found.scale_spread > MOST_SCALE_SPREAD and found.points < LEAST_POINTS
+    return found.scale_spread > MAX_SCALE_SPREAD and found.points < LEAST_POINTS
 
 
 def _pose_uncertain(found: Indicators) -> bool:
     """Whether scale and shape are each within their limit, but too doubtful together."""
     if _scale_uncertain(found) or found.depth_spread > MOST_DEPTH_SPREAD or found.points >= LEAST_POINTS:
         return False
-    shares = found.scale_spread / MOST_SCALE_SPREAD, found.depth_spread / MOST_DEPTH_SPREAD
+    shares = found.scale_spread / MAX_SCALE_SPREAD, found.depth_spread / MOST_DEPTH_SPREAD
     return math.hypot(*shares) > MOST_TOGETHER
 
 
