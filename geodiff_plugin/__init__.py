@@ -26,10 +26,10 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time names are i
     from geodiff_plugin.formats.reading import read_calibration as read_calibration
     from geodiff_plugin.priors import PRIORS as PRIORS
     from geodiff_plugin.priors import load_prior as load_prior
+    from geodiff_plugin.result.output import MetricDepthOutput as MetricDepthOutput
     from geodiff_plugin.runtime.guided_call import GuidedMarigoldDepthPipeline as GuidedMarigoldDepthPipeline
     from geodiff_plugin.runtime.guided_call import disable_geometry_guidance as disable_geometry_guidance
     from geodiff_plugin.runtime.guided_call import enable_geometry_guidance as enable_geometry_guidance
-    from geodiff_plugin.types import MetricDepthOutput as MetricDepthOutput
     from geodiff_plugin.types import Rig as Rig
 
 __version__ = "0.1.0"
@@ -48,7 +48,8 @@ _NAMES_OF = {
         "disable_geometry_guidance",
         "enable_geometry_guidance",
     ),
-    "types": ("MetricDepthOutput", "Rig"),
+    "result.output": ("MetricDepthOutput",),
+    "types": ("Rig",),
 }
 _MODULE_OF = modules_of(__name__, _NAMES_OF)
 __all__ = sorted(_MODULE_OF)

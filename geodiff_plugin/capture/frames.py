@@ -24,7 +24,7 @@ from geodiff_plugin.formats.lenses import undistorted
 from geodiff_plugin.formats.recordings import VideoReader
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.multiview import GivenFrames, SolvedCapture, solve_capture
-from geodiff_plugin.types import MetricDepthOutput
+from geodiff_plugin.result.output import MetricDepthOutput
 
 #: What a solve is called that moved the given poses, or estimated them.
 ADJUSTED = ("solved", "estimated")

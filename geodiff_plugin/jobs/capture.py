@@ -41,9 +41,9 @@ from geodiff_plugin.jobs.writing import write_maps
 from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.options import on_ray
 from geodiff_plugin.pose.multiview import SolvedCapture
+from geodiff_plugin.result.output import MetricDepthOutput
 from geodiff_plugin.runtime.guided_call import enable_geometry_guidance
 from geodiff_plugin.runtime.machine import pick_device
-from geodiff_plugin.types import MetricDepthOutput
 
 #: File of the solved poses, which an interrupted run reads again.
 POSES_FILE = "poses.npz"

@@ -13,7 +13,7 @@ from geodiff_plugin._checks import noted
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.reading import PairInputs
 from geodiff_plugin.messages import Message, distinct
-from geodiff_plugin.types import MetricDepthOutput
+from geodiff_plugin.result.output import MetricDepthOutput
 
 
 @dataclass

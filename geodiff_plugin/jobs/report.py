@@ -17,9 +17,10 @@ from geodiff_plugin.formats.out import REPORT
 from geodiff_plugin.jobs.records import PairRun
 from geodiff_plugin.messages import Message, as_records
 from geodiff_plugin.result.misfit import expected_error, misfit_of
+from geodiff_plugin.result.output import MetricDepthOutput
 from geodiff_plugin.result.standing import standing_words
 from geodiff_plugin.runtime.machine import versions
-from geodiff_plugin.types import UNTESTED, MetricDepthOutput
+from geodiff_plugin.types import UNTESTED
 
 
 def read_report(folder: Path) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from geodiff_plugin.jobs.options import DepthOptions, unique_names
 from geodiff_plugin.jobs.reading import PairInputs
 from geodiff_plugin.jobs.records import PairResult, PairRun
 from geodiff_plugin.jobs.report import build_report, report_text, single_map, used_poses
-from geodiff_plugin.types import MetricDepthOutput
+from geodiff_plugin.result.output import MetricDepthOutput
 
 #: Depth as the camera of ``--into`` sees it: floats, and whole millimetres.
 INTO = ("depth_into.npy", "depth_into_mm.png")

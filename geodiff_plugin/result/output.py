@@ -1,28 +1,157 @@
-"""``ImageResult`` of every image, stacked once into ``MetricDepthOutput``."""
+"""``MetricDepthOutput``, into which the ``ImageResult`` of every image is stacked once."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
+from diffusers.utils import BaseOutput
 from torch import Tensor
 
 from geodiff_plugin._certain import SD_PER_MAD
+from geodiff_plugin._reprojection import PosedCamera, depth_in_camera
 from geodiff_plugin.evidence.guidance import GeometryGuidance
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.estimate import NO_UNIT
 from geodiff_plugin.result.finish import ImageResult
 from geodiff_plugin.result.indicators import pose_of, warnings_of
 from geodiff_plugin.scale.space import joined
-from geodiff_plugin.types import MetricDepthOutput, StepReport
+from geodiff_plugin.types import PoseReport, StepReport, Verdict
 
 #: The user is warned if the visible share is below this: few pixels then determine the scale.
 LITTLE_OVERLAP = 0.3
 #: Fields of ``ImageResult`` that are maps.
 MAPS = ("depth_m", "uncertainty", "relative", "visible", "photometric_error", "confidence", "support")
+
+
+@dataclass
+class MetricDepthOutput(BaseOutput):
+    """Metric depth with confidence, diagnostics and warnings.
+
+    ``N`` images, ``E`` ensemble members, ``H W`` the resolution of the input image (or of the processing grid
+    with ``match_input_resolution=False``). Maps are shaped as ``prediction`` unless said otherwise.
+
+    Attributes:
+        prediction: metres; ``(N, H, W, 1)`` numpy or ``(N, 1, H, W)`` torch, as ``output_type`` says.
+        uncertainty: metres, median absolute deviation of the ensemble members, each refined like
+            ``prediction``; ``None`` without ``output_uncertainty=True``, or with fewer than two members.
+        latent: ``(N * E, 4, h, w)`` final latents, with ``output_latent=True``.
+        relative: median unclipped relative depth, about [0, 1].
+        scale: ``(N, E)`` softplus of the learnt scale.
+        shift: ``(N, E)`` softplus of the learnt shift.
+        global_scale: ``(N, E)`` metres, the pre-selected g_s of Eq. 16.
+        prior_scale: ``(N, E)`` median factor from a metric prior's metres to the result, else ``None``.
+        visible: boolean, in front of a right camera and inside its image; ``None`` without a right view.
+        photometric_error: [0, 1] mean absolute difference between the left image and the warped right view
+            that matches the pixel best; 0 where not visible; ``None`` without a right view.
+        confidence: [0, 1] probability that the depth is within 10 % of the truth, 0 where there is no depth
+            (``valid``); ``None`` without ``crisp``, or without matches and points.
+        support: [0, 1] how much matches and points, at the pixel or nearby on the same surface, determine the
+            depth; ``None`` where ``confidence`` is.
+        prior_error: ``(N,)`` error of the prior alone, standard deviation in log depth, estimated from
+            left-out matches or points; ``None`` where none were compared.
+        K: ``(N, 3, 3)`` intrinsics of the output grid, pixels.
+        history: one ``StepReport`` per round of a guided step and batch chunk.
+        poses: one ``PoseReport`` per image with right views.
+        extras: further maps of the prior by name (GeoWizard's ``"normals"``), but for their channels.
+        verdicts: one ``Verdict`` per image: whether the depth can be trusted, and why not.
+        unit: ``"m"``, or ``None`` if no length is known: lengths are then in the unit of the given poses, or
+            of the first estimated baseline.
+        scale_from: source of the scale of estimated poses: ``"baseline"``, ``"known length"``, ``"points"``,
+            ``"prior"`` or ``"none"``; ``None`` for given poses, but ``"prior"`` where they had no unit.
+        scale_spread: relative spread of that scale over matches or the prior's map; ``None`` if unknown.
+        rescaled: factor from the lengths of ``GeometryGuidance`` to metres, if only the prior knows the unit.
+        warnings: sentences for the user about this result, and those that the guidance gave when it was made;
+            each has a ``code`` (``geodiff_plugin.messages``, docs/reference/messages.md).
+        assumed: likewise on assumed inputs, such as the right camera's principal point.
+    """
+
+    prediction: np.ndarray | torch.Tensor
+    uncertainty: np.ndarray | torch.Tensor | None = None
+    latent: torch.Tensor | None = None
+    relative: np.ndarray | torch.Tensor | None = None
+    scale: torch.Tensor | None = None
+    shift: torch.Tensor | None = None
+    global_scale: torch.Tensor | None = None
+    prior_scale: torch.Tensor | None = None
+    visible: np.ndarray | torch.Tensor | None = None
+    photometric_error: np.ndarray | torch.Tensor | None = None
+    confidence: np.ndarray | torch.Tensor | None = None
+    support: np.ndarray | torch.Tensor | None = None
+    prior_error: torch.Tensor | None = None
+    K: np.ndarray | torch.Tensor | None = None
+    history: list[StepReport] = field(default_factory=list)
+    poses: list[PoseReport] = field(default_factory=list)
+    unit: str | None = "m"
+    scale_from: str | None = None
+    scale_spread: float | None = None
+    rescaled: float = 1.0
+    extras: dict[str, np.ndarray | torch.Tensor] = field(default_factory=dict)
+    verdicts: list[Verdict] = field(default_factory=list)
+    warnings: list[Message] = field(default_factory=list)
+    assumed: list[Message] = field(default_factory=list)
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict on all images: the first that is not trusted, else not judged, else trusted."""
+        if not self.verdicts:
+            raise AttributeError("This output has no verdict: no guided call made it.")
+        return min(self.verdicts, key=lambda v: ("not trusted", "not judged", "trusted").index(v.status))
+
+    @property
+    def valid(self) -> np.ndarray | torch.Tensor:
+        """Boolean, shaped as ``prediction``: where there is a depth.
+
+        Further away than the cameras can measure, where the views differ by less than 0.3 px, as in a sky,
+        there is none: ``prediction`` is that distance there, so that it can be shown, and ``confidence`` 0.
+        Clouds, meshes and other exports leave such pixels out.
+        """
+        positive = self.prediction > 0
+        return positive if self.confidence is None else positive & (self.confidence > 0)
+
+    def into(self, K: np.ndarray, E: np.ndarray, size: tuple[int, int]) -> np.ndarray | torch.Tensor:
+        """The depth as another camera sees it: of an infrared pair in the colour camera, say.
+
+        Where several surfaces lie behind a pixel the nearest counts. Between the pixels of one surface, which
+        the prior makes dense, there are no holes. What the left camera does not see has no depth, 0, nor has
+        what is not ``valid``.
+
+        Args:
+            K: ``(3, 3)`` pixels of that camera's image, without lens distortion.
+            E: ``(4, 4)`` pose of that camera in the left camera's frame, in the output's unit.
+            size: ``(width, height)`` of its image.
+
+        Returns:
+            Depth along z of that camera, shaped as ``prediction``: ``(N, height, width, 1)`` numpy or ``(N,
+            1, height, width)`` torch, float32.
+
+        Raises:
+            InputError: a K, E or size that is none.
+        """
+        camera = PosedCamera.checked(K, E, size)
+        if self.K is None:
+            raise AttributeError("This output has no K: no guided call made it.")
+        Ks = self.K if isinstance(self.K, np.ndarray) else self.K.numpy(force=True)
+        known = self.prediction * self.valid
+        depths = known[..., 0] if isinstance(known, np.ndarray) else known[:, 0].numpy(force=True)
+        pairs = zip(depths, Ks.astype(np.float64), strict=True)
+        seen = np.stack([depth_in_camera(depth, K_left, camera) for depth, K_left in pairs])
+        if isinstance(self.prediction, np.ndarray):
+            return seen[..., None]
+        return torch.from_numpy(seen[:, None]).to(self.prediction.device)
+
+    def __repr__(self) -> str:
+        """Sizes, range and verdict in a few lines, and no array."""
+        depth = self.prediction
+        depth = depth if isinstance(depth, np.ndarray) else depth.numpy(force=True)
+        unit = "" if self.unit is None else f" {self.unit}"
+        lines = [f"depth {depth.shape}, {np.nanmin(depth):.3g} to {np.nanmax(depth):.3g}{unit}"]
+        lines += [": ".join([verdict.status, *verdict.reasons[:1]]) for verdict in self.verdicts]
+        lines += [f"{len(self.warnings)} warnings", f"{len(self.assumed)} assumptions"]
+        return "MetricDepthOutput(" + "\n  ".join(lines) + ")"
 
 
 def stack_results(

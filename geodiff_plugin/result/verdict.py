@@ -93,10 +93,10 @@ MOST_MOVED = 0.15
 #: A larger shear of the right picture along its rows, in shares of its width, is not trusted: what is certain
 #: of it was 0 for 38 right pairs of parallel cameras, and .0048 to .021 for 9 of 14 with a shear of .023.
 MOST_SHEAR = 0.005
-#: A refined pose whose scale spreads by more than ``MAX_SCALE_SPREAD`` is not trusted, unless known depths give
-#: the scale. Nor is one whose scale and shape are within their limits, but together above this: the root of
-#: the sum of the squares of their ratios to these. It was up to 1.10 for 50 pairs of trackers whose poses were
-#: refined, and 1.21 where the refinement hid that K was of an image .67 times as large.
+#: A refined pose whose scale spreads by more than ``MAX_SCALE_SPREAD`` is not trusted, unless known depths
+#: give the scale. Nor is one whose scale and shape are within their limits, but together above this: the root
+#: of the sum of the squares of their ratios to these. It was up to 1.10 for 50 pairs of trackers whose poses
+#: were refined, and 1.21 where the refinement hid that K was of an image .67 times as large.
 MOST_TOGETHER = 1.15
 #: Known depths that fix a scale and a shift, and show when one of them is wrong.
 LEAST_POINTS = 3

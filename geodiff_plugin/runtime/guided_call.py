@@ -28,13 +28,12 @@ from geodiff_plugin.messages import Message, distinct
 from geodiff_plugin.priors import DepthPrior, prior_of
 from geodiff_plugin.priors.pipeline import RESAMPLING, DepthDiffusionPipeline
 from geodiff_plugin.result.ensemble import ensemble_metric
-from geodiff_plugin.result.output import image_labels
+from geodiff_plugin.result.output import MetricDepthOutput, image_labels
 from geodiff_plugin.runtime.codec import MapCodec, ProcessingGrid, tiny_autoencoder
 from geodiff_plugin.runtime.graphs import FasterNetworks
 from geodiff_plugin.runtime.hooks import Exclusive, Layers
 from geodiff_plugin.runtime.noise_levels import check_scheduler
 from geodiff_plugin.runtime.run import GuidedRun, StepCallback
-from geodiff_plugin.types import MetricDepthOutput
 
 #: What every stock pipeline's call takes, whatever the prior.
 STOCK_ARGUMENTS = (

@@ -20,11 +20,10 @@ from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.evidence.guidance import SAME_CENTRE, GeometryGuidance
 from geodiff_plugin.messages import Message
 from geodiff_plugin.result.finish import ResultOptions, finish
-from geodiff_plugin.result.output import stack_results
+from geodiff_plugin.result.output import MetricDepthOutput, stack_results
 from geodiff_plugin.runtime import hooks
 from geodiff_plugin.runtime.codec import MapCodec, StepEstimate, StepInputs
 from geodiff_plugin.runtime.noise_levels import noise_level
-from geodiff_plugin.types import MetricDepthOutput
 
 StepCallback = Callable[[Any, int, Any, dict[str, Tensor | None]], dict[str, Tensor] | None]
 

@@ -28,7 +28,8 @@ from geodiff_plugin.jobs.journal import Item, Record
 from geodiff_plugin.jobs.report import used_poses
 from geodiff_plugin.result.confidence import RIGHT_WITHIN
 from geodiff_plugin.result.misfit import expected_error, misfit_of
-from geodiff_plugin.types import DepthFrame, MetricDepthOutput
+from geodiff_plugin.result.output import MetricDepthOutput
+from geodiff_plugin.types import DepthFrame
 from tests.lab.options import TrustOptions
 
 #: A depth further off than this, as a share of the truth at the median pixel, is wrong enough to be told.

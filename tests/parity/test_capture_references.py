@@ -22,9 +22,9 @@ from geodiff_plugin.pose.multiview import SolvedCapture, _scaled
 from geodiff_plugin.pose.tracks import grey_image, grey_views
 from geodiff_plugin.result.indicators import measure_indicators
 from geodiff_plugin.result.misfit import expected_error
-from geodiff_plugin.result.output import _in_the_priors_metres
+from geodiff_plugin.result.output import MetricDepthOutput, _in_the_priors_metres
 from geodiff_plugin.result.voting import _enlarged
-from geodiff_plugin.types import CameraView, DepthFrame, MetricDepthOutput, PosedViews
+from geodiff_plugin.types import CameraView, DepthFrame, PosedViews
 
 K = np.array([[400.0, 0.0, 159.5], [0.0, 410.0, 119.5], [0.0, 0.0, 1.0]])
 

@@ -13,7 +13,8 @@ from geodiff_plugin.formats.points import read_ply_points
 from geodiff_plugin.jobs.bag import _valid_depth
 from geodiff_plugin.jobs.report import depth_summary
 from geodiff_plugin.jobs.writing import pixels_of, write_maps
-from geodiff_plugin.types import DepthFrame, MetricDepthOutput
+from geodiff_plugin.result.output import MetricDepthOutput
+from geodiff_plugin.types import DepthFrame
 
 K = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
 FAR = np.s_[:10]  # rows of a sky

@@ -12,7 +12,8 @@ from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.reading import PairInputs
 from geodiff_plugin.jobs.records import JobLog, PairRun
 from geodiff_plugin.messages import Message
-from geodiff_plugin.types import Indicators, MetricDepthOutput, PoseReport, Rig, StepReport, Verdict
+from geodiff_plugin.result.output import MetricDepthOutput
+from geodiff_plugin.types import Indicators, PoseReport, Rig, StepReport, Verdict
 
 #: ``(width, height)`` of the left image and of both right ones.
 SIZES = ((50, 36), (54, 40), (44, 34))

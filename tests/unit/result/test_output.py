@@ -12,8 +12,8 @@ from geodiff_plugin.evidence.evidence import Evidence
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.estimate import NO_UNIT
 from geodiff_plugin.result.finish import ImageResult
-from geodiff_plugin.result.output import image_labels, stack_results
-from geodiff_plugin.types import Indicators, MetricDepthOutput, PosedViews, PoseReport, StepReport, Verdict
+from geodiff_plugin.result.output import MetricDepthOutput, image_labels, stack_results
+from geodiff_plugin.types import Indicators, PosedViews, PoseReport, StepReport, Verdict
 
 COUNT, MEMBERS, SIZE = 3, 2, (5, 7)
 MAPS = {
