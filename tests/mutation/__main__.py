@@ -99,9 +99,9 @@ def _run(database: WorkDB, mutants: list[Mutant], tests: CoverageMap, options: a
     ):
         futures = {}
         for mutant in todo:
-            chosen = choose(
-                tests.covering(index.lines_executing(mutant.file, mutant.line)), options.test_seconds
-            )
+            place = mutant.file, mutant.line
+            covering = tests.covering(index.lines_executing(*place), index.namesake(*place))
+            chosen = choose(covering, options.test_seconds)
             if not chosen:
                 database.set_result(
                     _key(mutant), _result(mutant, Outcome(SURVIVED, 0.0, "no test executes it"))

@@ -75,6 +75,8 @@ def test_lines_that_execute_a_constant_are_its_uses(tmp_path: Path):
         "geodiff_plugin/a.py": 1 << 6,
         "geodiff_plugin/b.py": 1 << 4,
     }
+    assert index.namesake("geodiff_plugin/a.py", 1) == index.namesake("geodiff_plugin/a.py", 3) == "test_a.py"
+    assert index.namesake("geodiff_plugin/a.py", 4) is None
     body = (1 << 4) | (1 << 5) | (1 << 6)
     assert index.lines_executing("geodiff_plugin/a.py", 3) == {"geodiff_plugin/a.py": body}
     assert index.lines_executing("geodiff_plugin/a.py", 4) == {"geodiff_plugin/a.py": 1 << 4}
