@@ -168,3 +168,26 @@ def test_boundary_errors_are_distances_of_parallel_edges(moved):
     truth, pred = (np.where(np.arange(60)[None] < c, 2.0, 7.0).repeat(40, 0) for c in (30, 30 + moved))
     errors = metrics.boundary_errors(3.0 * pred, truth, np.ones(truth.shape, bool))
     assert errors == pytest.approx({"dbe_acc": moved, "dbe_comp": moved}, abs=0.2)
+
+
+@pytest.mark.parametrize(("least", "most", "first"), [(0.02, 0.12, 11), (0.02, 0.09, None), (0.1, 0.15, 0)])
+def test_weak_edges_count_where_they_are_connected_to_a_strong_one(least, most, first):
+    """A step whose height grows with the rows, beside one of height 1, and drawn 3 px away from the truth.
+
+    Behind a blur of sqrt(2) px Sobel's filter answers a step with 2.1 times its height, so that an edge is
+    weak from a height of about 0.048 on and strong from 0.095 on.
+    """
+    rows, heights = 40, np.linspace(least, most, 40)[:, None]
+    columns = np.arange(100)[None]
+    truth, pred = (1.0 * (columns >= 20) - heights * (columns >= at) + 1.0 for at in (60, 63))
+    found = metrics.boundary_errors(pred, truth, np.ones(truth.shape, bool))
+    drawn = 0 if first is None else rows - first
+    expected = 3 * drawn / (rows + drawn)
+    assert found == pytest.approx({"dbe_acc": expected, "dbe_comp": expected}, abs=0.12)
+
+
+def test_the_sparsification_error_takes_a_hundred_steps():
+    pred, truth, valid = maps(0, (20, 30))
+    sigma = np.random.default_rng(1).random(truth.shape)
+    areas = [metrics.ause(pred, truth, valid, sigma, steps) for steps in (99, 100, 101)]
+    assert metrics.ause(pred, truth, valid, sigma) == areas[1] and len(set(areas)) == 3

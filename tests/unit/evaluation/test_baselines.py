@@ -11,8 +11,17 @@ import torch
 
 from geodiff_plugin.config import DEFAULT, FAST, PAPER, PRIOR_FIT
 from geodiff_plugin.evaluation import baselines
-from geodiff_plugin.evaluation.baselines import FAMILIES, METHODS, NotApplicable, PriorCache, Settings, find_method
-from geodiff_plugin.evaluation.baselines import guided, method, unguided
+from geodiff_plugin.evaluation.baselines import (
+    FAMILIES,
+    METHODS,
+    NotApplicable,
+    PriorCache,
+    Settings,
+    find_method,
+    guided,
+    method,
+    unguided,
+)
 from geodiff_plugin.evaluation.datasets import SampleRef
 from geodiff_plugin.evaluation.datasets.sample import ExtraView, make_sample
 from geodiff_plugin.evidence.guidance import GeometryGuidance
@@ -36,10 +45,14 @@ def make(further=2, **changes):
         E[:2, 3] = x, y
         return E
 
-    views = tuple(ExtraView(image(36 + i, 50), camera(42 + i, 24), pose(0.3, 0.1 * (i + 1))) for i in range(further))
+    views = tuple(
+        ExtraView(image(36 + i, 50), camera(42 + i, 24), pose(0.3, 0.1 * (i + 1))) for i in range(further)
+    )
     rig = Rig(camera(50, 27), camera(50, 29.5), pose(0.2))
     depth = rng.uniform(1, 4, SIZE)
-    sample = make_sample(SampleRef("d", "s", {}), (image(*SIZE), image(*SIZE)), rig, depth, {}, extra_views=views)
+    sample = make_sample(
+        SampleRef("d", "s", {}), (image(*SIZE), image(*SIZE)), rig, depth, {}, extra_views=views
+    )
     return replace(sample, **changes)
 
 
@@ -54,7 +67,7 @@ def test_a_call_has_members_and_a_seeded_generator_and_only_what_was_chosen():
 def test_views_are_at_most_as_many_as_asked_with_the_left_pose_first():
     sample = make()
     right, K, E = guided.posed_views(sample, 2)
-    assert right is sample.right and K == (sample.K_left, sample.K_right) and E is sample.E
+    assert right is sample.right and (sample.K_left, sample.K_right) == K and E is sample.E
     for views in (3, 4, 9):
         images, Ks, Es = guided.posed_views(sample, views)
         more = sample.extra_views[: views - 2]
@@ -103,7 +116,11 @@ def test_a_guided_answer_is_the_first_maps_with_notes_of_every_number(spied):
     ((image, given),) = spied.spy.calls
     assert given == call | {"guidance": "guidance", "output_uncertainty": True}
     assert np.array_equal(image, make().left) and found.depth_m.shape == SIZE and found.relative is None
-    assert found.depth_m[0, 1] == 2 and (found.space, found.uncertainty[3, 4], found.confidence[2, 2]) == ("log", 0.3, 0.7)
+    assert found.depth_m[0, 1] == 2 and (found.space, found.uncertainty[3, 4], found.confidence[2, 2]) == (
+        "log",
+        0.3,
+        0.7,
+    )
     assert found.notes == {
         **{"warnings": ["said"], "scale": [1.234568], "shift": [-0.5, 0.5], "pose": "refined"},
         **{"residual_px_given": [1.235, 2.0], "residual_px": [0.5, 0.25], "visible": 0.6667},
@@ -186,6 +203,30 @@ def test_a_ramp_is_far_at_the_top_and_near_at_the_bottom(space, top):
     assert list(condition) == ["image_latent"] and made[0] is condition["image_latent"]
 
 
+def test_a_ramp_is_guided_in_as_many_rounds_as_the_preset_makes_with_the_prior(spied, monkeypatch):
+    handed = []
+    monkeypatch.setattr(guided, "enable_geometry_guidance", lambda pipe: pipe)
+    monkeypatch.setattr(guided, "guided_prediction", lambda *given: handed.append(given))
+    spied.spy.device, spied.spy.image_processor = torch.device("cpu"), "processor"
+    chosen = (Settings(), Settings(steps=3), Settings(resolution=32, ensemble=4, views=3))
+    for settings in chosen:
+        METHODS["no-diffusion"].run(make(), settings, spied.priors)
+    rounds = max(spied.spy.default_denoising_steps, DEFAULT.min_steps)
+    for (ramp, _, guidance, call), count, settings in zip(handed, (rounds, 3, rounds), chosen, strict=True):
+        assert (ramp.space, ramp.adapter, ramp.image_processor) == ("log", spied.adapter, "processor")
+        assert (ramp.default_denoising_steps, ramp.default_processing_resolution) == (count, 48)
+        assert guidance.config == DEFAULT.changed(reject_reflections=False, min_steps=count)
+        assert len(guidance.inputs[0].views) == settings.views - 1
+        assert call == ({"processing_resolution": 32} if settings.resolution else {})
+        assert guidance.evidence_store is spied.priors.evidence
+    spied.spy.default_processing_resolution = None
+    METHODS["no-diffusion"].run(make(), Settings(), spied.priors)
+    assert handed[-1][0].default_processing_resolution == 0
+    codec = SimpleNamespace(adapter=SimpleNamespace(decode=lambda z: 2 * z, encode=lambda x: x / 2))
+    ramp = guided.RampPrior
+    assert (ramp.decode(codec, 3.0), ramp.encode(codec, 3.0)) == (6.0, 1.5)
+
+
 def test_withheld_poses_keep_images_cameras_and_the_length_of_the_baseline(spied, monkeypatch):
     sample, asked = make(), []
 
@@ -199,8 +240,12 @@ def test_withheld_poses_keep_images_cameras_and_the_length_of_the_baseline(spied
     run = find_method("guided:pose=estimated").run
     run(sample, Settings(views=3), spied.priors)
     images, given = asked[0]
-    assert [id(i) for i in images] == [id(i) for i in (sample.left, sample.right, sample.extra_views[0].image)]
-    assert [id(k) for k in given["K"]] == [id(k) for k in (sample.K_left, sample.K_right, sample.extra_views[0].K)]
+    assert [id(i) for i in images] == [
+        id(i) for i in (sample.left, sample.right, sample.extra_views[0].image)
+    ]
+    assert [id(k) for k in given["K"]] == [
+        id(k) for k in (sample.K_left, sample.K_right, sample.extra_views[0].K)
+    ]
     assert given["baseline_m"] == pytest.approx(0.2) and spied.spy.calls[0][1]["guidance"] == "guidance"
     run(sample, Settings(), spied.priors)
     assert len(asked[1][0]) == len(asked[1][1]["K"]) == 2
@@ -216,7 +261,9 @@ def test_configurations_hold_every_setting_that_changes_a_result():
     assert set(plain) == {f.name for f in fields(Settings)} - free and plain["seed"] == 3
     default = METHODS["guided"].configuration(settings)
     assert set(default) == set(plain) | {"guidance"}
-    others = {str(METHODS[n].configuration(settings)["guidance"]) for n in ("guided", "fast", "paper", "prior-fit")}
+    others = {
+        str(METHODS[n].configuration(settings)["guidance"]) for n in ("guided", "fast", "paper", "prior-fit")
+    }
     assert len(others) == 4
     sweeps = METHODS["sweep-sgm"].configuration
     assert sweeps(Settings(views=3)) != sweeps(Settings()) != sweeps(Settings(device="cuda"))
@@ -246,7 +293,9 @@ def test_a_cache_loads_a_prior_once_for_each_choice(monkeypatch):
         return SimpleNamespace(set_progress_bar_config=lambda disable: enabled.append(disable))
 
     monkeypatch.setattr(method, "load_prior", load_prior)
-    monkeypatch.setattr(method, "enable_geometry_guidance", lambda pipe, **speed: enabled.append(speed) or object())
+    monkeypatch.setattr(
+        method, "enable_geometry_guidance", lambda pipe, **speed: enabled.append(speed) or object()
+    )
     cache, first = PriorCache(), Settings()
     pipe = cache.get(first)
     assert cache.get(replace(first, seed=3, steps=2, ensemble=5, views=4, resolution=9)) is pipe
@@ -257,7 +306,10 @@ def test_a_cache_loads_a_prior_once_for_each_choice(monkeypatch):
     pipes = {id(cache.get(replace(first, **change))) for change in changes}
     assert len(pipes | {id(pipe)}) == 7 == len(loaded)
     assert loaded[3][1] == {"device": "cpu", "dtype": torch.bfloat16} and loaded[4][1]["space"] == "log"
-    assert enabled[-3] == {"graphs": True, "kernels": True} and enabled[-1] == {"graphs": False, "kernels": False}
+    assert enabled[-3] == {"graphs": True, "kernels": True} and enabled[-1] == {
+        "graphs": False,
+        "kernels": False,
+    }
 
 
 def test_fingerprints_change_with_weights_shapes_and_configs():
@@ -309,7 +361,11 @@ def test_models_of_transformers_are_asked_for_the_left_image_in_its_size():
     assert found.relative[0, 2] == 2 and found.depth_m[0, 2] == 4
     model.metric = False
     assert hf.run(sample, Settings(), priors).depth_m is None
-    assert hf.configuration(Settings(device="cuda", dtype="float16")) == {"device": "cuda", "dtype": "float16", "files": ""}
+    assert hf.configuration(Settings(device="cuda", dtype="float16")) == {
+        "device": "cuda",
+        "dtype": "float16",
+        "files": "",
+    }
     assert (hf.title, hf.uses_prior) == ("some-model", False)
 
 

@@ -1,4 +1,4 @@
-"""What the readers of data sets take from a folder, which samples are selected, and how samples are changed."""
+"""What readers of data sets take from a folder, which samples are selected, how samples are changed."""
 
 import json
 import zlib
@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from geodiff_plugin.bundled.demo_pair import DEMO_PAIR_FOLDER
 from geodiff_plugin.evaluation import datasets
-from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, find_pairs, load, select
-from geodiff_plugin.evaluation.datasets import layouts
+from geodiff_plugin.evaluation.datasets import DATASETS, SampleRef, find_pairs, layouts, load, select
 from geodiff_plugin.evaluation.datasets import sample as module
 from geodiff_plugin.evaluation.datasets.sample import (
     ExtraView,
@@ -114,17 +113,29 @@ def test_scenes_are_of_the_set_that_truth_and_folders_name(tmp_path):
         **{"disparity": "m/New/disp0GT.pfm", "mask": "m/New/mask0nocc.png"},
     }
     other = named(tmp_path, find_pairs(tmp_path, ["eth3d"])[1])
-    assert other["disparity"] == "two_view_training_gt/y/disp0GT.pfm" and other["left"].endswith("training/y/im0.png")
+    assert other["disparity"] == "two_view_training_gt/y/disp0GT.pfm" and other["left"].endswith(
+        "training/y/im0.png"
+    )
     assert other["mask"] == "two_view_training_gt/y/mask0nocc.png"
 
 
 def test_booster_has_a_pair_of_every_lighting(tmp_path):
-    touch(tmp_path, "Cup/camera_00/im1.png", "Cup/camera_00/im0.png", "Cup/camera_02/im0.png", "Mono/camera_00/im0.png")
+    touch(
+        tmp_path,
+        "Cup/camera_00/im1.png",
+        "Cup/camera_00/im0.png",
+        "Cup/camera_02/im0.png",
+        "Mono/camera_00/im0.png",
+    )
     first, second = find_pairs(tmp_path, ["booster"])
     assert (first.label, second.name) == ("booster/Cup-im0", "Cup-im1")
     assert named(tmp_path, second) == {
         **{"left": "Cup/camera_00/im1.png", "right": "Cup/camera_02/im1.png", "disparity": "Cup/disp_00.npy"},
-        **{"occluded": "Cup/mask_00.png", "material": "Cup/mask_cat.png", "calibration": "Cup/calib_00-02.xml"},
+        **{
+            "occluded": "Cup/mask_00.png",
+            "material": "Cup/mask_cat.png",
+            "calibration": "Cup/calib_00-02.xml",
+        },
     }
 
 
@@ -164,11 +175,19 @@ def test_posed_pairs_take_sources_in_order_and_at_most_four_further_views(tmp_pa
     assert layouts._sources_of(folder / "pair.txt") == {4: [9, 7, 2, 1, 5, 3], 9: [4, 7], 7: []}
     touch(folder, "images/00000001.jpeg", "images/00000002.jpg", "images/00000002.png")
     (first,) = find_pairs(tmp_path, ["mvsnet"])
-    assert first.name == "scan" and first.files["views"] == (1, 2, 3, 4, 5, 7) and first.files["pixel_centre"] == 0.0
+    assert (
+        first.name == "scan"
+        and first.files["views"] == (1, 2, 3, 4, 5, 7)
+        and first.files["pixel_centre"] == 0.0
+    )
     files = named(tmp_path, first)
     assert files["left"] == "scan/images/00000001.jpeg" and files["right"] == "scan/images/00000002.png"
-    assert files["image 3"] == "scan/images/00000003.png" and files["camera 7"] == "scan/cams/00000007_cam.txt"
-    assert files["calibration"] == "scan/cams/00000001_cam.txt" and files["truth"] == "scan/depths/00000001.pfm"
+    assert (
+        files["image 3"] == "scan/images/00000003.png" and files["camera 7"] == "scan/cams/00000007_cam.txt"
+    )
+    assert (
+        files["calibration"] == "scan/cams/00000001_cam.txt" and files["truth"] == "scan/depths/00000001.pfm"
+    )
     assert files["calibration_right"] == "scan/cams/00000002_cam.txt"
     every = find_pairs(tmp_path, ["mvsnet"], pairs="all", pixel_centre=0.25)
     assert [(ref.name, ref.files["views"]) for ref in every] == [
@@ -200,9 +219,28 @@ def test_the_benchmark_takes_its_key_views_and_counts_truth_from_one(tmp_path):
 
 
 def test_own_folders_prefer_png_and_say_what_is_missing(tmp_path):
-    touch(tmp_path, "a/left.jpg", "a/left.png", "a/left.txt", "a/right.webp", "a/calib.yaml", "a/depth.pfm", "a/depth.png")
-    touch(tmp_path, "b/left.png", "b/calib_left.txt", "b/calib_right.txt", "c/left.png", "d/right.png", "d/calib.txt")
-    touch(tmp_path, "e/left.png", "e/calib_left.txt", "left.png", "right.png", "x/y/left.png", "x/y/right.png")
+    touch(
+        tmp_path,
+        "a/left.jpg",
+        "a/left.png",
+        "a/left.txt",
+        "a/right.webp",
+        "a/calib.yaml",
+        "a/depth.pfm",
+        "a/depth.png",
+    )
+    touch(
+        tmp_path,
+        "b/left.png",
+        "b/calib_left.txt",
+        "b/calib_right.txt",
+        "c/left.png",
+        "d/right.png",
+        "d/calib.txt",
+    )
+    touch(
+        tmp_path, "e/left.png", "e/calib_left.txt", "left.png", "right.png", "x/y/left.png", "x/y/right.png"
+    )
     found = {ref.name: named(tmp_path, ref) for ref in find_pairs(tmp_path, ["folder"])}
     assert list(found) == [tmp_path.name, "a", "b", "d"]
     assert found["a"] == {
@@ -232,7 +270,11 @@ def test_own_depth_is_read_in_metres_with_its_holes(tmp_path, suffix):
     sample = load(find_pairs(tmp_path, ["folder"])[0])
     np.testing.assert_allclose(sample.depth_m, depth, atol=1e-6)
     np.testing.assert_array_equal(sample.valid, depth > 0)
-    assert sample.notes == {"truth": path.name} and sample.label == f"folder/{tmp_path.name}" and sample.rectified
+    assert (
+        sample.notes == {"truth": path.name}
+        and sample.label == f"folder/{tmp_path.name}"
+        and sample.rectified
+    )
     path.unlink()
     sample = load(find_pairs(tmp_path, ["folder"])[0])
     assert not sample.valid.any() and sample.depth_m.shape == LARGE
@@ -254,6 +296,31 @@ def test_a_file_of_another_size_is_named_with_both_sizes(tmp_path):
     assert layouts._like(np.ones((*SIZE, 3)), Path("f"), values) is values
 
 
+@pytest.mark.parametrize("second", [None, Path("b.txt")])
+def test_calibrations_are_read_for_the_names_and_the_size_of_the_images(monkeypatch, second):
+    """The left image is 20 x 12 pixels, the right one 30 x 16; a calibration of other sizes is refused."""
+    images = {Path("l.png"): np.zeros((12, 20, 3), np.uint8), Path("r.png"): np.zeros((16, 30, 3), np.uint8)}
+    monkeypatch.setattr(layouts, "read_rgb", lambda path, name: images[path])
+    asked, sizes = [], {"size_left": (20, 12), "size_right": (30, 16)}
+    rig = Rig(np.eye(3), np.eye(3), np.eye(4), **sizes)
+    monkeypatch.setattr(
+        layouts, "read_calibration", lambda *given, **more: asked.append((given, more)) or rig
+    )
+    files = {"left": Path("l.png"), "right": Path("r.png"), "calibration": Path("a.txt")}
+    ref = SampleRef("d", "n", files | {"calibration_right": second, "cameras": (2, 3)})
+    (left, right), found = layouts._read_pair(ref)
+    assert left is images[files["left"]] and right is images[files["right"]] and found is rig
+    paths = Path("a.txt") if second is None else (Path("a.txt"), second)
+    named = {"image_names": ("l.png", "r.png"), "image_size": (20, 12)}
+    assert asked == [((paths, (2, 3), "l.png"), named)]
+    for side, file in (("left", "a.txt"), ("right", "a.txt" if second is None else "b.txt")):
+        rig = Rig(np.eye(3), np.eye(3), np.eye(4), **sizes | {f"size_{side}": (12, 20)})
+        with pytest.raises(
+            ValueError, match=f"{file} must be for .* pixels as the {side} image; got 12 x 20"
+        ):
+            layouts._read_pair(ref)
+
+
 K_LEFT = np.array([[50.0, 0, 11.0], [0, 60.0, 7.0], [0, 0, 1]])
 K_RIGHT = np.array([[50.0, 0, 14.5], [0, 60.0, 7.0], [0, 0, 1]])
 
@@ -265,7 +332,9 @@ def test_disparity_and_depth_are_inverse_with_offset_principal_points():
     depth = disparity_to_depth(disparity, K_LEFT, K_RIGHT, E)
     np.testing.assert_allclose(depth, [[15 / 5.5, 15 / 13.5, 15 / 2.5, 0, 0, 0, 0]], rtol=1e-6)
     assert depth.dtype == np.float32
-    np.testing.assert_allclose(depth_to_disparity(depth[:, :3], K_LEFT, K_RIGHT, E), disparity[:, :3], atol=1e-5)
+    np.testing.assert_allclose(
+        depth_to_disparity(depth[:, :3], K_LEFT, K_RIGHT, E), disparity[:, :3], atol=1e-5
+    )
     E[0, 3] = 0.0
     with pytest.raises(ValueError, match=r"E\[0, 3\] must be positive"):
         disparity_to_depth(disparity, K_LEFT, K_RIGHT, E)
@@ -279,7 +348,9 @@ def random_sample(rectified=True) -> StereoSample:
     depth = rng.uniform(2, 4, SIZE)
     depth[:2] = np.inf
     depth[2] = -1
-    images = tuple(cv2.GaussianBlur(rng.integers(0, 255, (*s, 3), dtype=np.uint8), (5, 5), 2) for s in (SIZE, (40, 60)))
+    images = tuple(
+        cv2.GaussianBlur(rng.integers(0, 255, (*s, 3), dtype=np.uint8), (5, 5), 2) for s in (SIZE, (40, 60))
+    )
     K = K_LEFT if rectified else K_LEFT * [[1], [1.1], [1]]
     return make_sample(SampleRef("d", "n", {}), images, Rig(K_LEFT, K, E), depth, {"truth": "t"})
 
@@ -365,16 +436,29 @@ def test_changes_are_named_by_their_numbers():
 @pytest.mark.parametrize(
     ("text", "option", "expected"),
     [
-        *((" 1.5 , .1 ", "--perturb", (1.5, 0.1)), ("30,0.9", "--perturb", (30, 0.9)), ("0,0", "--drift", (0, 0))),
+        *(
+            (" 1.5 , .1 ", "--perturb", (1.5, 0.1)),
+            ("30,0.9", "--perturb", (30, 0.9)),
+            ("0,0", "--drift", (0, 0)),
+        ),
         *(("5,20", "--drift", (5, 20)), ("30.1,0", "--perturb", None), ("0,0.91", "--perturb", None)),
-        *(("5.1,0", "--drift", None), ("0,20.1", "--drift", None), ("-1,0", "--drift", None), ("1", "--drift", None)),
+        *(
+            ("5.1,0", "--drift", None),
+            ("0,20.1", "--drift", None),
+            ("-1,0", "--drift", None),
+            ("1", "--drift", None),
+        ),
     ],
 )
 def test_two_numbers_are_read_within_their_ranges(text, option, expected):
     if expected is not None:
         assert two_numbers(text, option) == expected
         return
-    words = r"DEGREES,SHARE.*\[0, 30\] and \[0, 0.9\]" if option == "--perturb" else r"DEGREES,PIXELS.*\[0, 5\] and \[0, 20\]"
+    words = (
+        r"DEGREES,SHARE.*\[0, 30\] and \[0, 0.9\]"
+        if option == "--perturb"
+        else r"DEGREES,PIXELS.*\[0, 5\] and \[0, 20\]"
+    )
     with pytest.raises(ValueError, match=f"{option} must be {words}; got '{text}'"):
         two_numbers(text, option)
 
@@ -410,9 +494,13 @@ def test_scenes_then_a_draw_then_the_limit_then_wrong_poses(monkeypatch):
 
 
 def test_no_sample_and_two_of_one_name_are_refused():
-    with pytest.raises(ValueError, match=r"a folder with a sample with cave in its name; got f with d/room0, d/yard0"):
+    with pytest.raises(
+        ValueError, match=r"a folder with a sample with cave in its name; got f with d/room0, d/yard0"
+    ):
         datasets.some_pairs(REFS, Path("f"), ("cave",))
-    with pytest.raises(ValueError, match="a folder with a sample; got f with no sample of any known data set"):
+    with pytest.raises(
+        ValueError, match="a folder with a sample; got f with no sample of any known data set"
+    ):
         datasets.some_pairs([], Path("f"))
     with pytest.raises(ValueError, match="one sample of each name; got f with several d/yard3"):
         datasets.some_pairs([*REFS, REFS[7]], Path("f"))

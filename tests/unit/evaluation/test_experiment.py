@@ -1,4 +1,4 @@
-"""Every field of a record against metrics of explicit masks; pages, cells, keys and shards of an experiment."""
+"""Every field of a record against metrics of explicit masks; pages, cells, keys and shards."""
 
 import json
 import time
@@ -22,7 +22,7 @@ CAP_M = 7.0
 
 
 def make_sample(**changes) -> StereoSample:
-    """Random depth from 1 to 9 m with holes; other K, size and pixels of the right camera, which is turned."""
+    """Random depth from 1 to 9 m with holes; the right camera is turned and has another K and size."""
     rng = np.random.default_rng(0)
     E = np.eye(4)
     E[:3, :3] = Rotation.from_euler("xyz", (4, -9, 6), degrees=True).as_matrix()
@@ -134,13 +134,18 @@ def test_a_record_has_the_errors_of_each_mask_under_the_cap(matches):
     assert len(record["confidence"]) == 10
     for found, wanted in zip(record["confidence"], deciles, strict=True):
         assert found == pytest.approx(wanted, rel=1e-5)
-    edges = {"f1": metrics.boundary_f1(depth_m, truth, valid)} | metrics.boundary_errors(depth_m, truth, valid)
+    edges = {"f1": metrics.boundary_f1(depth_m, truth, valid)} | metrics.boundary_errors(
+        depth_m, truth, valid
+    )
     assert record["boundaries"] == plain(edges)
     sparse = replace(sample, valid=valid & (np.arange(SHAPE[1]) < 13))
     assert experiment.score(sparse, prediction, CAP_M)["boundaries"] is None
     bare = experiment.score(sample, Prediction(depth_m), CAP_M)
     assert [bare[n] for n in ("ause", "confidence", "ause_confidence")] == [None] * 3
-    assert experiment.score(sample, prediction, None)["capped"] == experiment.score(sample, prediction, 99)["capped"]
+    assert (
+        experiment.score(sample, prediction, None)["capped"]
+        == experiment.score(sample, prediction, 99)["capped"]
+    )
 
 
 def test_relative_depth_is_aligned_under_each_cap_and_by_region(matches):
@@ -159,7 +164,9 @@ def test_relative_depth_is_aligned_under_each_cap_and_by_region(matches):
     of = capped & matches
     error = np.abs(np.minimum(aligned, CAP_M) / sample.depth_m - 1)[of].mean()
     assert record["regions"]["matched"] == pytest.approx(error, rel=1e-4)
-    assert all(record[n] is None for n in ("disparity", "ause", "confidence", "ause_confidence", "boundaries"))
+    assert all(
+        record[n] is None for n in ("disparity", "ause", "confidence", "ause_confidence", "boundaries")
+    )
 
 
 def test_disparity_is_scored_on_all_visible_edge_and_flat_pixels(matches):
@@ -205,7 +212,9 @@ def test_depth_in_metres_is_as_it_is_and_relative_depth_is_aligned():
     sample = make_sample()
     kept = sample.valid & (sample.depth_m < 5)
     assert experiment.in_metres(Prediction(sample.left[..., 0]), sample.depth_m, kept) is not None
-    aligned = experiment.in_metres(Prediction(None, np.log(sample.depth_m) / 3 + 1, "log"), sample.depth_m, kept)
+    aligned = experiment.in_metres(
+        Prediction(None, np.log(sample.depth_m) / 3 + 1, "log"), sample.depth_m, kept
+    )
     np.testing.assert_allclose(aligned, sample.depth_m, rtol=1e-5)
     metres = 3 * sample.depth_m
     assert experiment.in_metres(Prediction(metres, sample.depth_m), sample.depth_m, kept) is metres
@@ -214,7 +223,11 @@ def test_depth_in_metres_is_as_it_is_and_relative_depth_is_aligned():
     }
 
 
-TABLES = (Table("First", ("a", "b"), (("x", "1"),)), Table("Empty", ("a",), ()), Table("Third", ("c",), (("_",),)))
+TABLES = (
+    Table("First", ("a", "b"), (("x", "1"),)),
+    Table("Empty", ("a",), ()),
+    Table("Third", ("c",), (("_",),)),
+)
 
 
 def options(tmp_path, **changes):
@@ -224,20 +237,29 @@ def options(tmp_path, **changes):
 
 @pytest.fixture
 def facts(monkeypatch):
-    known = {"command": "geodiff eval x", "date": "2026-01-02", "versions": {"p": "1", "q": "2"}, "machine": "m, 4"}
+    known = {
+        "command": "geodiff eval x",
+        "date": "2026-01-02",
+        "versions": {"p": "1", "q": "2"},
+        "machine": "m, 4",
+    }
     monkeypatch.setattr(experiment, "run_facts", lambda command, options: known)
     return known
 
 
 def test_a_page_is_written_as_markdown_latex_and_json(facts, tmp_path):
     results = tmp_path / "docs" / "page.md"
-    page = experiment.write_page("parts", options(tmp_path, results=results), "Title", TABLES, ["One.", "Two."])
+    page = experiment.write_page(
+        "parts", options(tmp_path, results=results), "Title", TABLES, ["One.", "Two."]
+    )
     shown = (TABLES[0], TABLES[2])
     assert (page.title, page.tables, page.remarks, page.broken) == ("Title", shown, ("One.", "Two."), ())
     assert page.facts == facts and page.origin() == "2026-01-02; p 1, q 2; m, 4."
     text = (tmp_path / "out" / "parts.md").read_text(encoding="utf-8")
     head = "# Title\n\n    geodiff eval x\n\n2026-01-02; p 1, q 2; m, 4.\n\nOne.\n\nTwo.\n\n"
-    assert text == head + shown[0].markdown() + "\n" + shown[1].markdown() == results.read_text(encoding="utf-8")
+    assert (
+        text == head + shown[0].markdown() + "\n" + shown[1].markdown() == results.read_text(encoding="utf-8")
+    )
     latex = (tmp_path / "out" / "parts.tex").read_text(encoding="utf-8")
     assert latex == shown[0].latex() + "\n" + shown[1].latex()
     plain = json.loads((tmp_path / "out" / "parts.json").read_text(encoding="utf-8"))
@@ -251,8 +273,9 @@ def test_a_page_is_written_as_markdown_latex_and_json(facts, tmp_path):
 def test_facts_are_command_date_versions_and_machine(monkeypatch):
     monkeypatch.setattr(experiment, "command_line", lambda command, options: f"{command} of {options}")
     monkeypatch.setattr(experiment.os, "cpu_count", lambda: 77)
+    before = time.strftime("%Y-%m-%d")
     found = experiment.run_facts("cost", "o")
-    assert found["command"] == "cost of o" and found["date"] == time.strftime("%Y-%m-%d")
+    assert found["command"] == "cost of o" and before <= found["date"] <= time.strftime("%Y-%m-%d")
     assert set(found) == {"command", "date", "versions", "machine"} and "77 cores, " in found["machine"]
     assert {"torch", "opencv"} <= set(found["versions"]) and "torch threads" in found["machine"]
 
@@ -318,7 +341,9 @@ def method(**changes):
 
 def test_a_measured_cell_records_cost_scores_notes_and_the_map(monkeypatch, tmp_path, matches):
     sample = make_sample(notes={"truth": "t"})
-    priors = SimpleNamespace(evidence=SimpleNamespace(take_spared_seconds=iter([50.0, 7.0, 0.0, 0.0]).__next__))
+    priors = SimpleNamespace(
+        evidence=SimpleNamespace(take_spared_seconds=iter([50.0, 7.0, 0.0, 0.0]).__next__)
+    )
     monkeypatch.setenv("RANK", "3")
     monkeypatch.setenv("WORLD_SIZE", "4")
     path = tmp_path / "maps" / "m.npy"
@@ -388,7 +413,9 @@ def test_cells_are_every_method_on_every_sample_with_a_name_a_map_and_a_key(monk
     monkeypatch.setattr(experiment.torch.cuda, "device_count", lambda: 4)
     on_gpu = cells(replace(settings, device="cuda"))
     assert on_gpu[0].payload.args[3].device == "cuda:1"
-    assert on_gpu[0].key == experiment.cell_key(REF, "files:a b/c", vars(replace(settings, device="cuda")), "")
+    assert on_gpu[0].key == experiment.cell_key(
+        REF, "files:a b/c", vars(replace(settings, device="cuda")), ""
+    )
     assert cells()[0].payload.args[3].device == "cpu:0"
 
 

@@ -44,14 +44,22 @@ def test_the_sweep_is_least_at_the_true_scale(sample, space):
     assert len(g_s) == 80 and (g_s[0], g_s[-1]) == pytest.approx((1, 20))
     np.testing.assert_allclose(g_s[1:] / g_s[:-1], 20 ** (1 / 79), rtol=1e-5)
     best = {name: g_s[sweep[name].argmin()] for name in ("loss", "abs_rel")}
-    assert best["loss"] == pytest.approx(factor, rel=0.08) and best["abs_rel"] == pytest.approx(factor, rel=0.03)
+    assert best["loss"] == pytest.approx(factor, rel=0.08) and best["abs_rel"] == pytest.approx(
+        factor, rel=0.03
+    )
     np.testing.assert_allclose(sweep["abs_rel"], np.abs(g_s / factor - 1), atol=0.03)
     assert (sweep["visible"] > 0).all() and (sweep["visible"] <= 1).all()
     assert sweep["visible"][sweep["loss"].argmin()] > 0.8 > sweep["visible"][0]
     at = int(sweep["loss"].argmin())
-    assert len(shown) == 4 and {at, int(sweep["abs_rel"].argmin()), 79} <= set(shown) and list(shown) == sorted(shown)
+    assert (
+        len(shown) == 4
+        and {at, int(sweep["abs_rel"].argmin()), 79} <= set(shown)
+        and list(shown) == sorted(shown)
+    )
     rendered = shown[at][12:-12, 16:-16], sample.left[12:-12, 16:-16] / 255
-    assert np.abs(np.subtract(*rendered)).mean() < 0.05 < np.abs(shown[79][12:-12, 16:-16] - rendered[1]).mean()
+    assert (
+        np.abs(np.subtract(*rendered)).mean() < 0.05 < np.abs(shown[79][12:-12, 16:-16] - rendered[1]).mean()
+    )
 
 
 def test_the_orbit_looks_at_its_centre_from_the_left_and_above():
@@ -106,9 +114,13 @@ def test_answers_have_the_error_in_their_title(sample, methods):
 
 
 @pytest.mark.parametrize("clouds", [False, True])
-def test_a_sample_is_shown_with_depth_truth_errors_and_clouds_on_one_scale(sample, methods, monkeypatch, clouds):
+def test_a_sample_is_shown_with_depth_truth_errors_and_clouds_on_one_scale(
+    sample, methods, monkeypatch, clouds
+):
     depths, errors, views = [], [], []
-    monkeypatch.setattr(figures, "colour_depth", lambda m, near, far: depths.append((m, near, far)) or "depth")
+    monkeypatch.setattr(
+        figures, "colour_depth", lambda m, near, far: depths.append((m, near, far)) or "depth"
+    )
     monkeypatch.setattr(figures, "colour_share", lambda e, most: errors.append((e, most)) or "error")
     monkeypatch.setattr(figures, "render_cloud", lambda m, *more: views.append((m, *more)) or "cloud")
     answers = [figures._answer(sample, name, Settings(), None) for name in ("half", "twice")]
@@ -116,7 +128,9 @@ def test_a_sample_is_shown_with_depth_truth_errors_and_clouds_on_one_scale(sampl
     truth = np.where(sample.valid, sample.depth_m, np.nan)
     assert pictures[0] is sample.left
     assert pictures[1:] == ["depth"] * 3 + ["error"] * 2 + ["cloud"] * 3 * clouds
-    for (shown, near, far), wanted in zip(depths, (answers[0].depth_m, answers[1].depth_m, truth), strict=True):
+    for (shown, near, far), wanted in zip(
+        depths, (answers[0].depth_m, answers[1].depth_m, truth), strict=True
+    ):
         np.testing.assert_array_equal(shown, wanted)
         assert np.nanmin(truth) <= near < np.nanquantile(truth, 0.1) < np.nanquantile(truth, 0.9) < far
     for (error, most), wanted in zip(errors, (0.5, 1.0), strict=True):
@@ -124,7 +138,10 @@ def test_a_sample_is_shown_with_depth_truth_errors_and_clouds_on_one_scale(sampl
         assert np.isnan(error[~sample.valid]).all() and most == 0.5
     assert titles[:4] == ["s", "Half, AbsRel 0.500", "Twice, AbsRel 1.000", titles[3]]
     assert titles[3] == f"truth, {depths[0][1]:.3g} m to {depths[0][2]:.3g} m"
-    assert titles[4:6] == ["error, 0 to 50% of the depth"] * 2 and titles[6:] == ["from the left, above"] * 3 * clouds
+    assert (
+        titles[4:6] == ["error, 0 to 50% of the depth"] * 2
+        and titles[6:] == ["from the left, above"] * 3 * clouds
+    )
     for (m, image, K, T), wanted in zip(views, (truth, answers[0].depth_m, answers[1].depth_m), strict=False):
         np.testing.assert_array_equal(m, wanted)
         assert image is sample.left and K is sample.K_left
@@ -134,9 +151,17 @@ def test_a_sample_is_shown_with_depth_truth_errors_and_clouds_on_one_scale(sampl
 def test_side_by_side_draws_every_sample_with_every_method(sample, methods, monkeypatch, tmp_path):
     gridded = []
     monkeypatch.setattr(figures, "select", lambda options: ["r1", "r2"])
-    monkeypatch.setattr(figures, "load", lambda ref: make_sample(
-        SampleRef("d", ref, {}), (sample.left, sample.right), Rig(sample.K_left, sample.K_right, sample.E),
-        sample.depth_m, {}))
+    monkeypatch.setattr(
+        figures,
+        "load",
+        lambda ref: make_sample(
+            SampleRef("d", ref, {}),
+            (sample.left, sample.right),
+            Rig(sample.K_left, sample.K_right, sample.E),
+            sample.depth_m,
+            {},
+        ),
+    )
     monkeypatch.setattr(figures, "grid", lambda *given, **more: gridded.append((*given, more)) or "grid")
     given = FigureOptions(name="qualitative", out=tmp_path)
     drawing = figures.draw_side_by_side(("half", "never", "twice"), given)
@@ -176,7 +201,9 @@ def test_curves_of_updates_are_means_in_order_with_bands_where_there_are_five(mo
     drawing = figures.draw_inner_steps(given)
     methods = [f"{preset}:inner_steps={n}" for preset in ("guided", "paper") for n in (2, 5, 9)]
     assert asked == [(given, refs, methods)]
-    assert drawing.numbers["updates"] == [2, 5, 9] and drawing.numbers["samples"] == [f"d/s{i}" for i in range(6)]
+    assert drawing.numbers["updates"] == [2, 5, 9] and drawing.numbers["samples"] == [
+        f"d/s{i}" for i in range(6)
+    ]
     left, right = drawing.picture.axes
     for preset, line, seconds, colour in zip(
         ("guided", "paper"), left.lines, right.lines, ("#0072B2", "#D55E00"), strict=True
@@ -247,7 +274,7 @@ def test_records_of_a_figure_are_measured_from_its_cells(monkeypatch, tmp_path):
     monkeypatch.setattr(figures, "method_cells", lambda *given: given)
     monkeypatch.setattr(figures, "measure_cells", lambda cells, options: [cells, options])
     given = FigureOptions(name="inner-steps", out=tmp_path)
-    ((refs, methods, settings, out), options), = [figures._records(given, ["r"], ["m"])]
+    (((refs, methods, settings, out), options),) = [figures._records(given, ["r"], ["m"])]
     assert (refs, methods, out, options) == (["r"], ["m"], tmp_path, given) and settings == given.settings
     monkeypatch.setattr(figures, "measure_cells", lambda cells, options: None)
     assert figures._records(given, ["r"], ["m"]) == []

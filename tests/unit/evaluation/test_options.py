@@ -58,7 +58,9 @@ def test_defaults_are_those_of_the_documentation(name):
 
 def test_the_commands_are_the_documented_ones_and_call_their_functions(monkeypatch):
     called = []
-    monkeypatch.setattr(module, "imported", lambda where: lambda *given: called.append((where, given)) or "page")
+    monkeypatch.setattr(
+        module, "imported", lambda where: lambda *given: called.append((where, given)) or "page"
+    )
     where = {"pairs": "pairs.run_pairs", "cost": "pairs.run_cost", "figure": "figures.run_figure"}
     where |= {"poses": "poses.run_poses", "capture": "captures.run_capture_eval"}
     where |= dict.fromkeys(("table1", "table2", "table3", "ablation"), "paper.run_paper_table")
@@ -72,7 +74,11 @@ def test_the_commands_are_the_documented_ones_and_call_their_functions(monkeypat
 def test_names_in_options_are_those_of_methods_and_figures():
     assert set(module.PEERS) <= set(METHODS) and set(module.FIGURES) == set(FIGURES)
     rows = {name: (row.poses, row.pose) for name, row in module.CAPTURE_ROWS.items()}
-    assert rows == {"given": ("given", "given"), "pairs": ("given", "refine"), "capture": ("refined", "given")}
+    assert rows == {
+        "given": ("given", "given"),
+        "pairs": ("given", "refine"),
+        "capture": ("refined", "given"),
+    }
 
 
 PAIRS = {"out": Path("out")}
@@ -117,7 +123,9 @@ def test_ray_has_workers_and_gpus_and_a_local_run_has_none():
 
 def test_methods_are_given_every_setting(monkeypatch):
     asked = []
-    monkeypatch.setattr("geodiff_plugin.runtime.machine.pick_device", lambda name: asked.append(name) or "cuda:1")
+    monkeypatch.setattr(
+        "geodiff_plugin.runtime.machine.pick_device", lambda name: asked.append(name) or "cuda:1"
+    )
     told = {"prior": "x/y", "ensemble": 3, "seed": 5, "steps": 7, "resolution": 640, "dtype": "float16"}
     told |= {"space": "log", "views": 4, "graphs": True, "no_kernels": True}
     given = PairsOptions(**told)
@@ -134,7 +142,14 @@ def samples_of(cls):
         **{"scenes": ("s",), "limit": 2, "ensemble": 3, "resolution": 640, "views": 4, "perturb": "1,0.2"},
         **{"sample": 6, "pairs": "all", "pixel_centre": 0.5, "steps": 9, "dtype": "float16", "space": "log"},
         **{"graphs": True, "no_kernels": True, "name": "ablation", "max": 20.0, "updates": (3, 4)},
-        **{"clouds": True, "exact": Path("e"), "drift": "0.1,2", "frames": "a,b", "count": 3, "device": "cpu"},
+        **{
+            "clouds": True,
+            "exact": Path("e"),
+            "drift": "0.1,2",
+            "frames": "a,b",
+            "count": 3,
+            "device": "cpu",
+        },
         **{"neighbours": (1, 7), "rows": ("pairs",), "quiet": True, "out": Path("o"), "save_depth": True},
     }
     if cls is CaptureEvalOptions:

@@ -68,7 +68,9 @@ def test_every_change_is_one_of_its_preset_and_the_first_is_none():
 def test_changes_are_means_worst_and_paired_differences_to_the_unchanged_preset():
     rng, methods = np.random.default_rng(0), ("paper", "paper:weights.prior_pull=0", "paper:rule=adam")
     records = [
-        record(method, str(i), *rng.uniform(0.1, 0.9, 3)) for method in methods for i in range(7 - (method != "paper"))
+        record(method, str(i), *rng.uniform(0.1, 0.9, 3))
+        for method in methods
+        for i in range(7 - (method != "paper"))
     ]
     table = pairs.changes_table([*records, record("sgbm", "0")], "paper")
     assert table.title == "Algorithm 1 as printed, one thing changed, 7 pairs"
@@ -93,7 +95,9 @@ def test_flatness_halves_and_doubles_every_number_and_names_the_pair_that_moves_
         value = value_of(number, DEFAULT)
         for method, factor in ((half, 0.5), (twice, 2.0)):
             name, _, changed = method.removeprefix("guided:").partition("=")
-            assert name == number and abs(float(changed) - factor * value) <= (0.5 if type(value) is int else 1e-5)
+            assert name == number and abs(float(changed) - factor * value) <= (
+                0.5 if type(value) is int else 1e-5
+            )
             find_method(method)
     rng = np.random.default_rng(3)
     records = [record(m, s, rng.uniform(0.2, 0.8)) for m in FLATNESS[:5] for s in "abc"]
@@ -130,7 +134,10 @@ def test_cost_is_the_median_time_and_the_greatest_peak_of_finished_pairs():
 
     plain = cost(records[5:10])
     for row, title, group in zip(
-        table.rows, ("guided", "plain pipeline", "paper"), (records[:5], records[5:10], records[10:15]), strict=True
+        table.rows,
+        ("guided", "plain pipeline", "paper"),
+        (records[:5], records[5:10], records[10:15]),
+        strict=True,
     ):
         seconds, peak = cost(group)
         assert row[:3] == (title, "5", f"{seconds:.2f}") and row[3] == f"{seconds / plain[0]:.2f}"

@@ -13,7 +13,7 @@ from geodiff_plugin.evaluation.pairs import CHANGES
 from geodiff_plugin.evaluation.paper import LAYOUTS, Column, Layout, Row
 from geodiff_plugin.evaluation.tables import REGIONS
 
-#: Read off the paper: columns with the number of pairs, metrics, and rows by title and kind.
+#: As the tables of the package print them, so that a slip shows: columns with the number of pairs, metrics, and rows by title and kind.
 PRINTED = {
     "table1": (
         {"KITTI-Stereo": 200, "Booster": 228, "Middlebury": 15},
@@ -93,7 +93,10 @@ def test_methods_run_once_the_papers_rows_before_peers_and_the_users():
     changed = [method for preset in ("guided", "paper") for _, method in CHANGES[preset]]
     assert ablation[:2] == ("paper:optimize_latents=false", "paper")
     assert set(changed) <= set(ablation) and len(ablation) == len(set(ablation))
-    assert not set(paper.methods_of("table3", ())) & {m for _, m in CHANGES["parts"]} - {"guided", "no-diffusion"}
+    assert not set(paper.methods_of("table3", ())) & {m for _, m in CHANGES["parts"]} - {
+        "guided",
+        "no-diffusion",
+    }
 
 
 def test_a_column_is_complete_with_the_papers_own_set_in_full():
@@ -107,7 +110,13 @@ def test_a_column_is_complete_with_the_papers_own_set_in_full():
 
 
 def test_a_users_method_fills_the_row_whose_word_it_names():
-    methods = ["guided", "files:maps/RAFT-Stereo", "hf:apple/DepthPro-hf", "hf:other/zoedepth", "prior-aligned"]
+    methods = [
+        "guided",
+        "files:maps/RAFT-Stereo",
+        "hf:apple/DepthPro-hf",
+        "hf:other/zoedepth",
+        "prior-aligned",
+    ]
     filled = {
         "guided": "guided",
         "files:DIR/raft-stereo": "files:maps/RAFT-Stereo",
@@ -122,7 +131,9 @@ def test_a_users_method_fills_the_row_whose_word_it_names():
 
 def record(method, dataset, sample, seed, metric=True):
     rng = np.random.default_rng(seed)
-    scores = ({m: float(v) for m, v in zip(paper.METRICS, rng.uniform(1, 9, 3), strict=True)} for _ in range(2))
+    scores = (
+        {m: float(v) for m, v in zip(paper.METRICS, rng.uniform(1, 9, 3), strict=True)} for _ in range(2)
+    )
     raw, aligned = scores
     head = {"method": method, "dataset": dataset, "sample": sample, "status": "ok"}
     return head | {"capped": {"raw": raw if metric else None, "aligned": aligned}}
@@ -150,12 +161,19 @@ def test_the_table_has_raw_and_aligned_means_and_published_cells_of_complete_col
     found += [columns[1]._replace(dataset="more", labels=frozenset(["more/c"]))]
     table = paper.layout_table(layout, found, records, methods)
     assert table.title == "Title"
-    assert table.groups == (("", 2), ("One (2 pairs)", 3), ("One, as published", 3), ("Two (more, 1 pair)", 3))
+    assert table.groups == (
+        ("", 2),
+        ("One (2 pairs)", 3),
+        ("One, as published", 3),
+        ("Two (more, 1 pair)", 3),
+    )
     assert table.header == ("Method", "GT-aligned", *["AbsRel ↓", "δ1 ↑", "RMSE m ↓"] * 3)
 
     def means(method, kind, wanted):
         of = [r["capped"][kind] for r in records if r["method"] == method and r["sample"] in wanted]
-        return [f"{np.mean([s[m] for s in of]):.3f}" if len(of) == len(wanted) else "-" for m in paper.METRICS]
+        return [
+            f"{np.mean([s[m] for s in of]):.3f}" if len(of) == len(wanted) else "-" for m in paper.METRICS
+        ]
 
     def line(title, method, kind, published):
         sign = "✓" if kind == "aligned" else "✗"
@@ -171,8 +189,9 @@ def test_the_table_has_raw_and_aligned_means_and_published_cells_of_complete_col
         line("SGBM + fill†", "sgbm", "raw", nothing),
         line("SGBM + fill", "sgbm", "aligned", nothing),
     )
-    assert table.note.endswith(" Not run here: Theirs (--methods files:DIR/theirs), "
-                               "Theirs aligned (--methods files:DIR/theirs).")
+    assert table.note.endswith(
+        " Not run here: Theirs (--methods files:DIR/theirs), Theirs aligned (--methods files:DIR/theirs)."
+    )
     two = layout._replace(metrics=("abs_rel", "delta1"), rows=rows[:1])
     table = paper.layout_table(two, found, records, ["guided"])
     assert "Not run" not in table.note and len(table.header) == 8 and table.groups[1] == ("One (2 pairs)", 2)
@@ -185,7 +204,9 @@ def there(monkeypatch):
 
     def all_refs(options, datasets=()):
         names = datasets or options.datasets or counts
-        return [SampleRef(d, f"s{i}", {"pairs": options.pairs}) for d in names for i in range(counts.get(d, 0))]
+        return [
+            SampleRef(d, f"s{i}", {"pairs": options.pairs}) for d in names for i in range(counts.get(d, 0))
+        ]
 
     monkeypatch.setattr(paper, "all_refs", all_refs)
     return counts
@@ -200,8 +221,13 @@ def test_a_column_takes_the_first_set_that_is_there_and_asked_for(there, tmp_pat
     assert paper._find(column, only, draw=False)[0].dataset == "kitti2015"
     drawn = paper._find(column, options, draw=True)[1]
     assert len(drawn) == 2
-    many = {tuple(r.name for r in paper._find(column, PairsOptions(data=tmp_path, out=tmp_path, seed=s), draw=True)[1])
-            for s in range(9)}
+    many = {
+        tuple(
+            r.name
+            for r in paper._find(column, PairsOptions(data=tmp_path, out=tmp_path, seed=s), draw=True)[1]
+        )
+        for s in range(9)
+    }
     assert len(many) > 1
     exact = column._replace(full_count=4)
     assert len(paper._find(exact, options, draw=True)[1]) == 4
@@ -254,7 +280,11 @@ def test_a_table_measures_the_pairs_of_its_columns_and_says_what_is_missing(ther
         *("KITTI-Stereo (2 pairs)", "Booster (not found)", "Middlebury (middlebury2014, 4 pairs)"),
     ]
     assert [t.title for t in summaries] == [
-        *("All metrics, KITTI-Stereo, 2 pairs", "All metrics, Booster, 0 pairs", "All metrics, Middlebury, 4 pairs"),
+        *(
+            "All metrics, KITTI-Stereo, 2 pairs",
+            "All metrics, Booster, 0 pairs",
+            "All metrics, Middlebury, 4 pairs",
+        ),
     ]
     assert [len(t.rows) for t in summaries] == [2, 0, 2] and last.title == REGIONS
 
@@ -271,9 +301,16 @@ def test_the_ablation_shows_both_presets_changed(there, compared):
     paper.run_paper_table("ablation", PairsOptions(out=Path("out"), sample=2))
     ((_, given, made),) = compared
     assert given.pairs == "default" and len(made.refs) == 6 and made.remarks == []
-    titles = [table.title for table in made.tables([record("paper", "kitti2015", made.refs[0].name, 0)
-                                                   | {"seconds": 1.0, "regions": {}}
-                                                   | {"capped": {"raw": None, "aligned": None}}])]
+    titles = [
+        table.title
+        for table in made.tables(
+            [
+                record("paper", "kitti2015", made.refs[0].name, 0)
+                | {"seconds": 1.0, "regions": {}}
+                | {"capped": {"raw": None, "aligned": None}}
+            ]
+        )
+    ]
     assert titles[0] == LAYOUTS["ablation"].title and titles[-1] == REGIONS
     assert [t.partition(",")[0] for t in titles[1:3]] == ["The default preset", "Algorithm 1 as printed"]
     assert len(titles) == 7
@@ -283,7 +320,11 @@ def test_the_ablation_shows_both_presets_changed(there, compared):
     ("name", "data", "words"),
     [
         ("table2", None, "--data must be given; got nothing. Booster: booster_gt.zip"),
-        ("table2", "here", "--data must be a folder with the data of table2; got here.* Booster was not found"),
+        (
+            "table2",
+            "here",
+            "--data must be a folder with the data of table2; got here.* Booster was not found",
+        ),
         ("ablation", "none", "--data must be a folder with the data of ablation; got none"),
     ],
 )

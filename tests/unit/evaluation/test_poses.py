@@ -1,4 +1,4 @@
-"""Which pairs and poses each table of ``geodiff eval poses`` compares, and how often a warning was missing."""
+"""Which pairs and poses each table of ``geodiff eval poses`` compares, and which warnings were missing."""
 
 from types import SimpleNamespace
 
@@ -19,19 +19,33 @@ KINDS = {"a": (True, 0), "b": (False, 2), "c": (True, 1), "d": (False, 0)}
 def record(sample, error, warnings=(), rectified=True, **notes):
     scores = {"raw": None if error is None else {"abs_rel": error}, "aligned": {"abs_rel": 0.01}}
     status = "not applicable" if error is None else "ok"
-    head = {"dataset": "d", "sample": sample, "status": status, "rectified": rectified, "key": f"{sample}{error}"}
+    head = {
+        "dataset": "d",
+        "sample": sample,
+        "status": status,
+        "rectified": rectified,
+        "key": f"{sample}{error}",
+    }
     return head | {"all_pixels": scores, "notes": {"method": {"warnings": list(warnings), **notes}}}
 
 
 def test_errors_of_changed_pairs_are_shown_under_the_names_of_the_first_column():
     columns = {
         "true": [record("a", 0.1), record("b", 0.2), record("c", 0.3, rectified=False)],
-        "wrong": [record("a-turn", 0.26), record("b-turn", 0.5, ["said"]), record("c-turn", None, rectified=False)],
+        "wrong": [
+            record("a-turn", 0.26),
+            record("b-turn", 0.5, ["said"]),
+            record("c-turn", None, rectified=False),
+        ],
         "lost": [record(name, None) for name in ("a-x", "b-x")] + [record("c-x", None, rectified=False)],
         "edge": [record("a", 0.25), record("b", 0.9), record("c", 0.8, rectified=False)],
     }
     table = poses.poses_table("Title", columns, "Note")
-    assert (table.title, table.note, table.header) == ("Title", "Note", ("pair", "true", "wrong", "lost", "edge"))
+    assert (table.title, table.note, table.header) == (
+        "Title",
+        "Note",
+        ("pair", "true", "wrong", "lost", "edge"),
+    )
     assert table.rows == (
         ("d/a", "0.100", "0.260", "-", "0.250"),
         ("d/b", "0.200", "0.500", "-", "0.900"),
@@ -77,7 +91,9 @@ def known(monkeypatch):
 
 
 def test_every_table_has_its_pairs_poses_and_number_of_views(known, tmp_path):
-    given = PosesOptions(data=tmp_path / "real", exact=tmp_path / "exact", out=tmp_path, perturb="2,0.25", drift="0.5,3")
+    given = PosesOptions(
+        data=tmp_path / "real", exact=tmp_path / "exact", out=tmp_path, perturb="2,0.25", drift="0.5,3"
+    )
     poses.run_poses("poses", given)
     ((name, options, made),) = known
     assert (name, options, made.title, made.journal) == ("poses", given, "Results by pose", "samples.jsonl")
@@ -85,7 +101,9 @@ def test_every_table_has_its_pairs_poses_and_number_of_views(known, tmp_path):
     names = {title: [] for title in dict.fromkeys(cell.head["table"] for cell in made.cells)}
     for cell in made.cells:
         head = cell.head
-        names[head["table"]].append((head["column"], head["method"].partition("=")[2], head["sample"], head["views"]))
+        names[head["table"]].append(
+            (head["column"], head["method"].partition("=")[2], head["sample"], head["views"])
+        )
         assert head["out"] == tmp_path and head["method"].startswith("guided:pose=")
     ways = (("refined", "refine"), ("given", "given"), ("estimated", "estimated"))
     drifted, turned = "-drift0.5-3px", "-turn2-shift0.25"
@@ -105,16 +123,27 @@ def test_every_table_has_its_pairs_poses_and_number_of_views(known, tmp_path):
         ],
     }
     records = [
-        {**record(c.head["sample"], 0.1 + i / 99, residual_px=[i / 4]), "table": c.head["table"], "column": c.head["column"]}
+        {
+            **record(c.head["sample"], 0.1 + i / 99, residual_px=[i / 4]),
+            "table": c.head["table"],
+            "column": c.head["column"],
+        }
         for i, c in enumerate(made.cells)
     ]
     shown = made.tables(records)
     assert [table.title for table in shown] == [*list(names)[:1], "Residuals", *list(names)[1:]]
-    assert [row[:3] for row in shown[1].rows] == [(f"d/{s}", "-", f"{i / 4:.2f}") for i, s in enumerate("abcd")]
+    assert [row[:3] for row in shown[1].rows] == [
+        (f"d/{s}", "-", f"{i / 4:.2f}") for i, s in enumerate("abcd")
+    ]
     assert shown[1].note == poses.RESIDUAL_NOTE
     for table, words in zip(
         (shown[0], shown[2], shown[3], shown[4]),
-        ("withheld but for", "", "turned by 0.5 degrees and its image has moved by 3 px", "by up to 2 degrees and shifted by up to 25 %"),
+        (
+            "withheld but for",
+            "",
+            "turned by 0.5 degrees and its image has moved by 3 px",
+            "by up to 2 degrees and shifted by up to 25 %",
+        ),
         strict=True,
     ):
         assert words in table.note and bool(table.note) == bool(words)
@@ -138,6 +167,8 @@ def test_no_drift_drifts_no_pair_and_the_limit_is_of_real_pairs(known, tmp_path)
 
 def test_the_settings_of_a_table_are_those_of_the_options_but_for_the_views(known, monkeypatch, tmp_path):
     seen = []
-    monkeypatch.setattr(experiment, "method_cells", lambda refs, methods, settings, out: seen.append(settings) or [])
+    monkeypatch.setattr(
+        experiment, "method_cells", lambda refs, methods, settings, out: seen.append(settings) or []
+    )
     poses.run_poses("poses", PosesOptions(data=tmp_path / "real", out=tmp_path, seed=7))
     assert {s.seed for s in seen} == {7} and np.unique([s.views for s in seen]).tolist() == [2, 3]

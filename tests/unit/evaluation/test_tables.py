@@ -92,7 +92,9 @@ def test_cells_of_numbers_nothing_and_nan():
 
 
 GROUPS = (("", 1), ("one | two", 2))
-TABLE = Table("Errors & more", ("name", "a_b", "δ ↓"), (("x|y", "1 %", "-"), ("z", "2", "3")), "Note.", GROUPS)
+TABLE = Table(
+    "Errors & more", ("name", "a_b", "δ ↓"), (("x|y", "1 %", "-"), ("z", "2", "3")), "Note.", GROUPS
+)
 
 
 def test_markdown_has_a_rectangle_of_cells_and_one_heading_a_column():
@@ -223,7 +225,7 @@ def test_a_method_without_metres_needs_an_oracle_and_its_heading_says_so(monkeyp
     relative, metric = (make_records("sgbm", i, 2, metric=bool(i)) for i in (0, 1))
     assert [heading for heading, _ in tables.method_columns(relative)] == ["SGBM + fill + oracle"]
     assert tables.method_columns(metric) == [("SGBM + fill", metric)]
-    (heading, _), = tables.method_columns(make_records("prior-aligned", 0, 2, metric=False))
+    ((heading, _),) = tables.method_columns(make_records("prior-aligned", 0, 2, metric=False))
     assert heading == "prior + oracle"
     nothing = [r | {"status": "broken"} for r in relative]
     assert tables.method_columns(nothing)[0][0] == "SGBM + fill"
