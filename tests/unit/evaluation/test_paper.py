@@ -13,7 +13,7 @@ from geodiff_plugin.evaluation.pairs import CHANGES
 from geodiff_plugin.evaluation.paper import LAYOUTS, Column, Layout, Row
 from geodiff_plugin.evaluation.tables import REGIONS
 
-#: As the tables of the package print them, so that a slip shows: columns with the number of pairs, metrics, and rows by title and kind.
+#: As the package has the tables, so that a slip shows: columns with pairs, metrics, rows by title and kind.
 PRINTED = {
     "table1": (
         {"KITTI-Stereo": 200, "Booster": 228, "Middlebury": 15},
