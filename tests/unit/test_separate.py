@@ -1,6 +1,5 @@
 """A process that does work for this one: answers, errors, warnings, and its end."""
 
-import errno
 import math
 import os
 import signal
@@ -16,10 +15,17 @@ import psutil
 import pytest
 import torch
 
-from geodiff_plugin._checks import InputFileError, noted, warn
+from geodiff_plugin._checks import InputFileError, noted
 from geodiff_plugin.jobs.failures import DiskFull, full_disk
 from geodiff_plugin.jobs.separate import ProcessEnded, SeparateProcess, SeparateProcesses
-from geodiff_plugin.messages import Message
+from tests.unit.jobs.work_elsewhere import (
+    cannot_begin,
+    clears_away,
+    fails_in_its_own_way,
+    make_and_wait,
+    wait_for,
+    warns,
+)
 
 
 @pytest.fixture(scope="module")
@@ -27,25 +33,6 @@ def process():
     process = SeparateProcess("math")
     yield process
     process.close()
-
-
-def fails_in_its_own_way(full: bool) -> None:
-    class Odd(Exception):
-        def __init__(self, one, two):
-            super().__init__(f"{one}{two}")
-
-    if full:
-        try:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        except OSError as error:
-            raise full_disk(error) from None
-    raise Odd("no", "body")
-
-
-def warns(where: str) -> str:
-    warn(Message("camera.filled-in", f"cy is assumed in {where}."))
-    print("a library prints")
-    return where
 
 
 def test_it_answers_with_arrays_tensors_and_from_another_process(process):
@@ -92,23 +79,9 @@ def test_a_killed_process_is_said_so_and_closing_it_is_no_error():
     process.close()
 
 
-def wait_for(path: str) -> int:
-    """The process's number, once another process has made the file."""
-    until = time.monotonic() + 60
-    while not os.path.exists(path):
-        assert time.monotonic() < until
-        time.sleep(0.01)
-    return os.getpid()
-
-
-def make_and_wait(made: str, awaited: str) -> int:
-    open(made, "w").close()
-    return wait_for(awaited)
-
-
 def test_several_processes_work_at_once_and_the_loss_of_one_is_said(tmp_path):
     first, second = str(tmp_path / "first"), str(tmp_path / "second")
-    processes = SeparateProcesses(__name__, 2)
+    processes = SeparateProcesses(make_and_wait.__module__, 2)
     with ThreadPoolExecutor(2) as pool:  # each waits for the other
         calls = [
             pool.submit(processes.call, make_and_wait, *files) for files in permutations((first, second))
@@ -145,18 +118,10 @@ def test_it_ends_when_the_process_that_asks_is_killed(work):
         time.sleep(0.05)
 
 
-def clears_away(began: str, cleared: str) -> None:
-    open(began, "w").close()
-    try:
-        time.sleep(600)
-    finally:
-        open(cleared, "w").close()
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM to be caught")
 def test_one_that_is_ended_clears_away_what_it_is_at(tmp_path):
     began, cleared = tmp_path / "began", tmp_path / "cleared"
-    process = SeparateProcess(__name__)
+    process = SeparateProcess(clears_away.__module__)
     with ThreadPoolExecutor(1) as pool:
         called = pool.submit(process.call, clears_away, str(began), str(cleared))
         wait_for(str(began))
@@ -168,12 +133,8 @@ def test_one_that_is_ended_clears_away_what_it_is_at(tmp_path):
     process.close()
 
 
-def cannot_begin() -> None:
-    raise ProcessEnded("It cannot begin.")
-
-
 def test_one_whose_function_says_that_it_has_ended_is_ended():
-    process = SeparateProcess(__name__)
+    process = SeparateProcess(cannot_begin.__module__)
     with pytest.raises(ProcessEnded, match="It cannot begin"):
         process.call(cannot_begin)
     with pytest.raises(ProcessEnded, match="has ended"):
