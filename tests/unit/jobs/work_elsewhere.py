@@ -1,4 +1,4 @@
-"""What tests of runners and processes have others do, in a module whose imports let a process start at once."""
+"""What tests of runners and processes have others do; its imports let a process start at once."""
 
 import errno
 import os
