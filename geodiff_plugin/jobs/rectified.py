@@ -53,9 +53,12 @@ def _matches(left_01: np.ndarray, right_01: np.ndarray) -> tuple[np.ndarray, np.
         image = torch.from_numpy(image_01).permute(2, 0, 1)
         views.append(grey_image(image, torch.eye(3), min(1.0, LONG_SIDE / max(image_01.shape[:2]))))
     tracks = sparse_tracks(views)
-    # With K = 1 the rays of the smaller pictures are pixels of these.
-    right = replace(tracks, left_px=tracks.right_px[0], K_left=tracks.K_rights[0])
-    return tracks.rays[:, :2], right.rays[:, :2]
+    return _enlarged(tracks.left_px, tracks.K_left), _enlarged(tracks.right_px[0], tracks.K_rights[0])
+
+
+def _enlarged(pixels: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Pixels ``(N, 2)`` of a reduced image on the image itself; ``K`` is what the reduction made of K = 1."""
+    return np.linalg.solve(K, np.c_[pixels, np.ones(len(pixels))].T).T[:, :2]
 
 
 def off_lines_px(rig: Rig, left: np.ndarray, right: np.ndarray) -> float:
