@@ -31,8 +31,7 @@ def main(arguments: list[str]) -> int:
     tests = CoverageMap(FOLDER / "coverage", words if options.keep_records else None)
     tests.update(options.processes)
     with use_db(FOLDER / f"{_name(options)}.sqlite", WorkDB.Mode.create) as database:
-        _register(database, mutants, options.retry)
-        _run(database, mutants, tests, options)
+        _run(database, _to_run(database, mutants, options.retry), tests, options)
         return _report(mutants, _results(database), options.at_least)
 
 
@@ -73,23 +72,20 @@ def _key(mutant: Mutant) -> str:
     return f"{mutant.file}:{hashlib.sha256(mutant.code.encode()).hexdigest()[:16]}"
 
 
-def _register(database: WorkDB, mutants: list[Mutant], retry: bool) -> None:
-    """Store the mutants that are not stored; with ``retry``, survivors become pending again."""
-    results = _results(database)
-    kept = {key: result for key, result in results.items() if not (retry and _status(result) == SURVIVED)}
-    database.clear()
+def _to_run(database: WorkDB, mutants: list[Mutant], retry: bool) -> list[Mutant]:
+    """The mutants without a result, and with ``retry`` the survivors; all become items of the database."""
+    known = {item.job_id for item in database.work_items}
     for mutant in mutants:
-        spec = MutationSpec(
-            mutant.file, mutant.operator, mutant.occurrence, (mutant.line, 0), (mutant.line, 1)
-        )
-        database.add_work_item(WorkItem.single(_key(mutant), spec))
-        if _key(mutant) in kept:
-            database.set_result(_key(mutant), kept[_key(mutant)])
+        if _key(mutant) not in known:
+            place = (mutant.line, 0), (mutant.line, 1)
+            spec = MutationSpec(mutant.file, mutant.operator, mutant.occurrence, *place)
+            database.add_work_item(WorkItem.single(_key(mutant), spec))
+    status = {key: _status(result) for key, result in _results(database).items()}
+    again = (None, SURVIVED) if retry else (None,)
+    return [mutant for mutant in mutants if status.get(_key(mutant)) in again]
 
 
-def _run(database: WorkDB, mutants: list[Mutant], tests: CoverageMap, options: argparse.Namespace) -> None:
-    pending = {item.job_id for item in database.pending_work_items}
-    todo = [mutant for mutant in mutants if _key(mutant) in pending]
+def _run(database: WorkDB, todo: list[Mutant], tests: CoverageMap, options: argparse.Namespace) -> None:
     if not todo:
         return
     index, context = LineIndex(ROOT), multiprocessing.get_context("spawn")
