@@ -127,8 +127,8 @@ def _run_pytest(root: Path, tests: Sequence[str]) -> int:
 
 
 def _wait(child: int, limit_s: float) -> str:
-    """The outcome of a forked run; what waits for ever is ended at six times the CPU limit."""
-    deadline = time.monotonic() + 6 * limit_s
+    """The outcome of a forked run; what waits for ever is ended at twice the CPU limit."""
+    deadline = time.monotonic() + 2 * limit_s
     while time.monotonic() < deadline:
         ended, status = os.waitpid(child, os.WNOHANG)
         if ended:
