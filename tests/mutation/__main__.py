@@ -95,8 +95,8 @@ def _run(database: WorkDB, todo: list[Mutant], tests: CoverageMap, options: argp
     ):
         futures = {}
         for mutant in todo:
-            place = mutant.file, mutant.line
-            covering = tests.covering(index.lines_executing(*place), index.namesake(*place))
+            lines = index.lines_executing(mutant.file, mutant.line)
+            covering = tests.covering(mutant.file, lines)
             chosen = choose(covering, options.test_seconds)
             if not chosen:
                 database.set_result(

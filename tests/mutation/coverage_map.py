@@ -70,16 +70,17 @@ class CoverageMap:
             for name, test in self._load(file)["tests"].items()
         ]
 
-    def covering(self, lines: Masks, namesake: str | None = None) -> list[RecordedTest]:
-        """The tests that execute one of these lines, those that execute little else first.
+    def covering(self, module: str, lines: Masks) -> list[RecordedTest]:
+        """The tests that execute one of these lines, and the module's own; those that execute little else first.
 
-        With ``namesake``, the tests in files of that name too.
+        What runs when a module is imported counts for no test, or for the first one that imports it. The tests in
+        files named after the module are therefore always among them.
         """
+        own = f"/test_{Path(module).stem}.py::"
         found = [
             test
             for test in self.tests
-            if any(test.lines.get(file, 0) & mask for file, mask in lines.items())
-            or (namesake is not None and f"/{namesake}::" in test.name)
+            if own in test.name or any(test.lines.get(file, 0) & mask for file, mask in lines.items())
         ]
         return sorted(found, key=lambda test: (test.breadth, test.name))
 
@@ -164,16 +165,6 @@ class LineIndex:
             path.relative_to(root).as_posix(): ast.parse(path.read_text(encoding="utf-8"))
             for path in (root / PACKAGE).rglob("*.py")
         }
-
-    def namesake(self, file: str, line: int) -> str | None:
-        """The name of the file with a module's tests, for a line that runs when the module is imported.
-
-        No single test executes such a line, and a test may read what it defines without executing any other,
-        as tests of all options do.
-        """
-        function = _innermost(self.trees[file], line, (ast.FunctionDef, ast.AsyncFunctionDef))
-        at_import = function is None or line < function.body[0].lineno
-        return f"test_{Path(file).stem}.py" if at_import else None
 
     def lines_executing(self, file: str, line: int) -> Masks:
         """Lines by file.

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("cosmic_ray", reason="extra dev")
 
 from tests.mutation.__main__ import choose
-from tests.mutation.coverage_map import LineIndex, RecordedTest
+from tests.mutation.coverage_map import CoverageMap, LineIndex, RecordedTest
 from tests.mutation.operators import mutated, positions
 from tests.mutation.sampling import ROOT, draw, equivalents, package_files
 from tests.mutation.worker import KILLED, SURVIVED, TIMED_OUT, Checkout
@@ -75,12 +75,23 @@ def test_lines_that_execute_a_constant_are_its_uses(tmp_path: Path):
         "geodiff_plugin/a.py": 1 << 6,
         "geodiff_plugin/b.py": 1 << 4,
     }
-    assert index.namesake("geodiff_plugin/a.py", 1) == index.namesake("geodiff_plugin/a.py", 3) == "test_a.py"
-    assert index.namesake("geodiff_plugin/a.py", 4) is None
     body = (1 << 4) | (1 << 5) | (1 << 6)
     assert index.lines_executing("geodiff_plugin/a.py", 3) == {"geodiff_plugin/a.py": body}
     assert index.lines_executing("geodiff_plugin/a.py", 4) == {"geodiff_plugin/a.py": 1 << 4}
     assert index.lines_executing("geodiff_plugin/a.py", 6) == {"geodiff_plugin/a.py": (1 << 5) | (1 << 6)}
+
+
+def test_the_tests_of_a_line_are_those_that_execute_it_and_the_modules_own(tmp_path: Path):
+    recorded = CoverageMap(tmp_path)
+    a, b = "geodiff_plugin/a.py", "geodiff_plugin/b.py"
+    recorded.tests = [
+        RecordedTest("tests/test_wide.py::t", 1.0, {a: 0b1110, b: 0b10}),
+        RecordedTest("tests/test_narrow.py::t", 1.0, {a: 0b0100}),
+        RecordedTest("tests/test_other.py::t", 1.0, {b: 0b0100}),
+        RecordedTest("tests/unit/test_a.py::t", 1.0, {}),
+    ]
+    found = [test.name.split("::")[0] for test in recorded.covering(a, {a: 0b0100})]
+    assert found == ["tests/unit/test_a.py", "tests/test_narrow.py", "tests/test_wide.py"]
 
 
 def test_tests_are_chosen_in_order_within_the_time():

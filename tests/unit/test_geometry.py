@@ -324,6 +324,28 @@ def test_a_screen_hides_what_rays_of_the_right_camera_do_not_reach():
             assert (marks == 1).sum() > 60
             assert (hidden[clear] == (marks[clear] == 1)).mean() > 0.995
             assert hidden[marks == 1].mean() > 0.97
+    # The same in a mirror, for either axis.
+    for axis, (side, side_right) in enumerate(((80, 110), (60, 50))):
+        mirror = np.eye(4)
+        mirror[axis, axis] = -1
+        mirrored = [mirror[:3, :3] @ each @ mirror[:3, :3] for each in (K_left, K_r)]
+        for each, last in zip(mirrored, (side - 1, side_right - 1), strict=True):
+            each[:, axis, 2] += last
+        flipped = depth.flip(3 - axis)
+        again = g.hidden_in_right(flipped, *map(batch, (*mirrored, mirror @ T @ mirror)), (50, 110))
+        assert (again.flip(3 - axis) != found).sum() == 0
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_strip_that_is_hidden_is_not_a_pixel_wider_than_by_rays(axis):
+    """Disparities of 12.1 and 6.05 px: the square begins at 12.4, where pixel 18 of the wall is at 11.95."""
+    depth = torch.full((1, 1, 60, 60), 4.0)
+    depth[..., 25:40, 25:40] = 2.0
+    wide = tensor(camera(40.0, 29.5, 29.5)).float()
+    at = np.roll([0.605, 0.0, 0.0], axis)
+    hidden = g.hidden_in_right(depth, wide, wide, tensor(T_of(at)).float(), (60, 60))[0, 0]
+    row = hidden[30] if axis == 0 else hidden[:, 30]
+    assert row.nonzero()[:, 0].tolist() == list(range(19, 25))
 
 
 @pytest.mark.parametrize(("ratio", "hides"), [(1.045, False), (1.06, True)])

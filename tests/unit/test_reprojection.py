@@ -170,16 +170,18 @@ def test_depth_comes_back_from_another_camera():
     assert np.median(off) < 1e-5 and (off < 2e-3).mean() > 0.97
 
 
-def test_a_depth_is_within_a_twentieth_of_the_nearest_point_in_its_pixel():
+@pytest.mark.parametrize("scale", [1.0, 0.3])
+def test_a_depth_is_within_a_twentieth_of_the_nearest_point_in_its_pixel(scale):
     """At the edge of the screen a pixel shows the screen, though the ray of its centre may miss it."""
     depth = cast(K, np.eye(4), SIZE)[0]
-    found = depth_in_camera(depth, K, OBLIQUE)
+    K_to, size = np.diag([scale, scale, 1.0]) @ OBLIQUE.K, (int(scale * 150), int(scale * 130))
+    found = depth_in_camera(depth, K, OBLIQUE._replace(K=K_to, size=size))
     v, u = np.mgrid[: SIZE[1], : SIZE[0]]
     rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
     points = (rays * depth[..., None] - OBLIQUE.E[:3, 3]) @ OBLIQUE.E[:3, :3]
-    pixels = points @ OBLIQUE.K.T
+    pixels = points @ K_to.T
     at = np.rint(pixels[..., :2] / pixels[..., 2:]).astype(int)
-    width, height = OBLIQUE.size
+    width, height = size
     inside = ((at >= 0) & (at < [width, height])).all(-1)
     nearest = np.full((height, width), np.inf)
     np.minimum.at(nearest, (at[inside][:, 1], at[inside][:, 0]), points[inside][:, 2])
@@ -236,3 +238,13 @@ def test_surfaces_next_to_or_behind_the_other_camera_are_not_seen():
     ahead = seen[seen[:, 2] > 0]
     assert 0 < len(ahead) < len(points) and np.isfinite(found).all() and (found >= 0).all()
     assert found.max() <= ahead[:, 2].max() * 1.05
+
+
+def test_the_nearest_part_of_a_surface_has_no_holes_though_most_of_it_is_far():
+    """A camera ahead sees the near wall four times as large as the first one does, and the far one alike."""
+    depth = np.full((40, 100), 12.0)
+    depth[:, 80:] = 2.0
+    square = np.array([[60.0, 0, 88.0], [0, 60.0, 19.5], [0, 0, 1]])
+    found = depth_in_camera(depth, square, PosedCamera(square, pose(at=(0, 0, 1.5)), (100, 40)))
+    near = found[:, 60:]  # columns from 80.5 on of the first camera
+    np.testing.assert_allclose(near, 0.5, rtol=1e-4)

@@ -99,19 +99,19 @@ def test_depth_and_cameras_of_every_frame_put_the_walls_where_they_are(unit, tmp
 
 
 def test_cameras_that_frames_have_in_common_are_written_once(tmp_path):
-    """And nothing that only some of them have in common."""
+    """And nothing that only the first and the last have in common."""
     capture = Capture.open(write_capture(tmp_path / "scan"))
     K = KS[0].copy()
     K[0, 0] = KS[1][0, 0]
 
     def alike(name: str) -> SplatFrame:
         found = load("a")
-        return replace(found, depth=replace(found.depth, name=name, K=KS[0] if name == "c" else K))
+        return replace(found, depth=replace(found.depth, name=name, K=KS[0] if name == "a" else K))
 
     write_splats(tmp_path / "out", capture, ORDER, alike, CLOUD, None)
     data = json.loads((tmp_path / "out/transforms.json").read_text())
     assert data["fl_y"] == KS[0][1, 1] and (data["w"], data["h"]) == SIZES[0]
-    assert [entry["fl_x"] for entry in data["frames"]] == [KS[0][0, 0], K[0, 0], K[0, 0]]
+    assert [entry["fl_x"] for entry in data["frames"]] == [K[0, 0], KS[0][0, 0], K[0, 0]]
     assert "fl_x" not in data and not any("fl_y" in entry or "w" in entry for entry in data["frames"])
 
 

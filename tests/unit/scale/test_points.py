@@ -204,13 +204,17 @@ def reference_fit(x, inverse, confidence, step, near, far, space, rounds=12):
     return min(near, 0.98 * far), far
 
 
+@pytest.mark.parametrize("step", [0.03, 0.4])
 @pytest.mark.parametrize("space", TO)
-def test_a_fit_to_matches_is_reweighted_least_squares(space):
-    """Noise, outliers and confidences that differ, and three maps at once of which no two are alike."""
+def test_a_fit_to_matches_is_reweighted_least_squares(space, step):
+    """Noise, outliers and confidences that differ, and three maps at once of which no two are alike.
+
+    A plane of 0.4 / m is more than the inverse depth of the farthest pixels.
+    """
     rng = np.random.default_rng(1)
     x = random_maps(3, seed=1)
     x[1] = np.clip(x[0] + rng.normal(0, 0.05, SIZE), 0, 1)
-    truth, step = metres(x[0], 0.5, 4.0, space), 0.03
+    truth = metres(x[0], 0.5, 4.0, space)
     confidence = rng.uniform(0, 1, SIZE) * (rng.random(SIZE) < 0.7)
     inverse = np.maximum(
         1 / truth + rng.normal(0, 0.5, SIZE) * step * np.sqrt((1 - confidence) / 0.04), -0.002
@@ -227,9 +231,9 @@ def test_a_fit_to_matches_is_reweighted_least_squares(space):
             x[b][used], np.maximum(inverse[used], 0), confidence[used], step, near[b], far[b], space
         )
         np.testing.assert_allclose([found[0][b], found[1][b]], expected, rtol=2e-3)
-    assert found[0][0].item() == pytest.approx(0.5, rel=0.02) and found[1][0].item() == pytest.approx(
-        4, rel=0.05
-    )
+    if step < 0.1:
+        assert found[0][0].item() == pytest.approx(0.5, rel=0.02)
+        assert found[1][0].item() == pytest.approx(4, rel=0.05)
 
 
 @pytest.mark.parametrize("space", TO)
