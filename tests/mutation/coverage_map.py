@@ -71,10 +71,10 @@ class CoverageMap:
         ]
 
     def covering(self, module: str, lines: Masks) -> list[RecordedTest]:
-        """The tests that execute one of these lines, and the module's own; those that execute little else first.
+        """The tests that execute one of these lines, and the module's own; the most specific ones first.
 
-        What runs when a module is imported counts for no test, or for the first one that imports it. The tests in
-        files named after the module are therefore always among them.
+        What runs when a module is imported counts for no test, or for the first one that imports it. Tests in
+        files named after the module are therefore always included.
         """
         own = f"/test_{Path(module).stem}.py::"
         found = [
