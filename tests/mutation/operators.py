@@ -289,6 +289,8 @@ def _ignored_part(node: NodeOrLeaf) -> tuple[NodeOrLeaf, NodeOrLeaf] | None:
         return node.children[0], node.children[1]
     if node.type in ("param", "funcdef") and node.annotation is not None:
         return node.annotation, node.annotation
+    if node.type == "operator" and node.parent.type in ("parameters", "lambdef"):
+        return node, node  # the star in front of keyword-only parameters is no product
     if node.type == "argument" and node.get_code().strip() == "strict=True":
         return node, node  # of zip: states that lengths are equal, which they are by construction
     pattern = {

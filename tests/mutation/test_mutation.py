@@ -43,7 +43,7 @@ def test_annotations_and_logging_are_left_alone():
     source = textwrap.dedent(
         """
         __all__ = ["a", "b"]
-        def f(size: tuple[1, 2] | None) -> dict[0, 1]:
+        def f(size: tuple[1, 2] | None, *, key: int) -> dict[0, 1]:
             _log.info("%d of %d", size, 3)
         """
     )

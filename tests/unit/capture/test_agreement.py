@@ -184,7 +184,7 @@ def test_agreement_does_not_depend_on_the_unit_or_on_the_order_of_the_frames():
 def made_up_matches(count: int, seed: int = 0):
     """Two images with matching features at the exact pixels of random points, and the motion between them.
 
-    Points are at whole pixels of the first, whose depth map is right only there.
+    Points are at pixels of the first, whose depth map is right only there.
     """
     rng = np.random.default_rng(seed)
     T = np.eye(4)
@@ -199,6 +199,9 @@ def made_up_matches(count: int, seed: int = 0):
     depth = np.full((height, width), 50.0)
     z = rng.uniform(2, 6, count)
     depth.flat[at] = z
+    # Features may lie a little outside of the outermost pixel centres.
+    px[:3] = [[width - 0.4, 50], [70, height - 0.4], [-0.6, 33]]
+    depth[50, -1], depth[-1, 70], depth[33, 0] = z[:3]
     points = np.c_[px, np.ones(count)] @ np.linalg.inv(K_before).T * z[:, None]
     seen = (points @ T[:3, :3].T + T[:3, 3]) @ K_after.T
     px_after = seen[:, :2] / seen[:, 2:]
