@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from geodiff_plugin.messages import Message
+from geodiff_plugin.result.output import MetricDepthOutput
 from geodiff_plugin.types import (
     CameraView,
     DepthFrame,
     Indicators,
-    MetricDepthOutput,
     PosedViews,
     Rig,
     StepReport,
