@@ -159,3 +159,23 @@ def test_a_folder_keeps_what_it_had_but_for_bin_files(tmp_path):
     assert load_file(target / "unet" / "diffusion_pytorch_model.safetensors")["w"].tolist() == [1, 1]
     assert load_file(target / "model.safetensors")["w"].tolist() == [0] * 4
     assert target.stat().st_mode & 0o777 == 0o755 and len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_checkpoint_of_an_unknown_kind_is_named_with_its_keys(tmp_path):
+    file = tmp_path / "other.pt"
+    torch.save({"first": torch.ones(2), "second": torch.ones(3)}, file)
+    with pytest.raises(
+        ValueError, match=r"SRC must be a checkpoint of a known kind \(depthfm, ppd\)"
+    ) as error:
+        convert._convert_file(file, tmp_path, None)
+    assert f"got {file} with the keys first, second. docs/reference/priors.md" in str(error.value)
+
+
+def test_a_prompt_that_is_nowhere_near_says_how_to_name_it(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"--with must be the folder .* of huawei-bayerlab/marigold-v2-0"
+    ) as error:
+        convert._read_prompt(tmp_path / "weights.pt", None)
+    assert "got none beside. Name it: --with .../" in str(error.value)
+    with pytest.raises(ValueError, match=f"got {tmp_path / 'absent'}. Name it"):
+        convert._read_prompt(tmp_path / "weights.pt", str(tmp_path / "absent"))
