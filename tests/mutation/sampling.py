@@ -20,7 +20,6 @@ from tests.mutation.operators import mutated, positions
 EXCLUDED = {
     r"kernels\.py$": "Triton kernels, which are compared with their references on their own",
     r"/messages\.py$": "wording",
-    r"/jobs/(ray|cluster|actor|parquet)\.py$": "run by Ray alone, whose tests start a cluster and are slow",
     r"/cli/(terminal|info)\.py$": "wording and layout of the terminal",
     r"/__main__\.py$": "one call",
 }
