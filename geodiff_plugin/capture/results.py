@@ -124,6 +124,12 @@ def save_alone(folder: Path, depth: np.ndarray, confidence: np.ndarray | None) -
             np.save(temporary, values.astype(np.float32))
 
 
+def read_agreed(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and confidence ``(H, W)`` of a frame after agreement."""
+    depth, confidence = (np.load(folder / f"{file}.npy") for file in AGREED[:2])
+    return depth, confidence
+
+
 def clear_frame(folder: Path) -> None:
     """Remove what a run wrote of a frame; files of others stay, and then the folder."""
     names = [*(f"{file}.npy" for file in (*ALONE, *AGREED)), *FIGURES, *files_of_report(folder), REPORT]

@@ -42,36 +42,32 @@ class Encoding:
     rows: float = 1.0
 
 
-#: OpenCV names Bayer patterns by the second row, ROS by the first.
-BAYER = {"rggb": "BG", "bggr": "RG", "gbrg": "GR", "grbg": "GB"}
+def _encodings() -> dict[str, Encoding]:
+    table = {
+        **dict.fromkeys(("uyvy", "yuv422"), Encoding("u1", 2, cv2.COLOR_YUV2RGB_UYVY)),
+        **dict.fromkeys(("yuyv", "yuy2", "yuv422_yuy2"), Encoding("u1", 2, cv2.COLOR_YUV2RGB_YUYV)),
+        "nv12": Encoding("u1", 1, cv2.COLOR_YUV2RGB_NV12, 1.5),
+        "nv21": Encoding("u1", 1, cv2.COLOR_YUV2RGB_NV21, 1.5),
+        "mono10": Encoding("u2", 1, cv2.COLOR_GRAY2RGB),
+        "mono12": Encoding("u2", 1, cv2.COLOR_GRAY2RGB),
+        "32FC1": Encoding("f4", 1, cv2.COLOR_GRAY2RGB),
+        "32FC3": Encoding("f4", 3, cv2.COLOR_BGR2RGB),
+    }
+    for bits in (8, 16):
+        kind = f"u{bits // 8}"
+        table |= {f"rgb{bits}": Encoding(kind, 3, None), f"rgba{bits}": Encoding(kind, 4, cv2.COLOR_RGBA2RGB)}
+        # OpenCV's own types say nothing of colours; its images are BGR.
+        table |= dict.fromkeys((f"bgr{bits}", f"{bits}UC3"), Encoding(kind, 3, cv2.COLOR_BGR2RGB))
+        table |= dict.fromkeys((f"bgra{bits}", f"{bits}UC4"), Encoding(kind, 4, cv2.COLOR_BGRA2RGB))
+        table |= dict.fromkeys((f"mono{bits}", f"{bits}UC1"), Encoding(kind, 1, cv2.COLOR_GRAY2RGB))
+        # OpenCV names Bayer patterns by the second row, ROS by the first.
+        for name, opencv in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB")):
+            table[f"bayer_{name}{bits}"] = Encoding(kind, 1, getattr(cv2, f"COLOR_Bayer{opencv}2RGB"))
+    return table
+
+
 #: By the name that a message has, whose letters may be large or small.
-ENCODINGS = {
-    **dict.fromkeys(("uyvy", "yuv422"), Encoding("u1", 2, cv2.COLOR_YUV2RGB_UYVY)),
-    **dict.fromkeys(("yuyv", "yuy2", "yuv422_yuy2"), Encoding("u1", 2, cv2.COLOR_YUV2RGB_YUYV)),
-    "nv12": Encoding("u1", 1, cv2.COLOR_YUV2RGB_NV12, 1.5),
-    "nv21": Encoding("u1", 1, cv2.COLOR_YUV2RGB_NV21, 1.5),
-    "mono10": Encoding("u2", 1, cv2.COLOR_GRAY2RGB),
-    "mono12": Encoding("u2", 1, cv2.COLOR_GRAY2RGB),
-    "32FC1": Encoding("f4", 1, cv2.COLOR_GRAY2RGB),
-    "32FC3": Encoding("f4", 3, cv2.COLOR_BGR2RGB),
-    **{
-        name: Encoding(f"u{bits // 8}", channels, code)
-        for bits in (8, 16)
-        for names, channels, code in (
-            ((f"rgb{bits}",), 3, None),
-            ((f"rgba{bits}",), 4, cv2.COLOR_RGBA2RGB),
-            # OpenCV's own types say nothing of colours; its images are BGR.
-            ((f"bgr{bits}", f"{bits}UC3"), 3, cv2.COLOR_BGR2RGB),
-            ((f"bgra{bits}", f"{bits}UC4"), 4, cv2.COLOR_BGRA2RGB),
-            ((f"mono{bits}", f"{bits}UC1"), 1, cv2.COLOR_GRAY2RGB),
-            *(
-                ((f"bayer_{pattern}{bits}",), 1, getattr(cv2, f"COLOR_Bayer{opencv}2RGB"))
-                for pattern, opencv in BAYER.items()
-            ),
-        )
-        for name in names
-    },
-}
+ENCODINGS = _encodings()
 
 
 def decode_image(message: Any, path: Path) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 from geodiff_plugin._certain import MAX_SCALE_SPREAD
 from geodiff_plugin._checks import bad_value, check_positive
 from geodiff_plugin.capture.frames import Capture
-from geodiff_plugin.capture.results import AGREED
+from geodiff_plugin.capture.results import read_agreed
 from geodiff_plugin.formats.lenses import undistorted_pixels
 from geodiff_plugin.jobs.options import CaptureOptions
 from geodiff_plugin.messages import Message
@@ -158,8 +158,7 @@ def measure(
     """
 
     def maps_of(name: str) -> tuple[np.ndarray, np.ndarray]:
-        depth, confidence = (np.load(out / name / f"{file}.npy") for file in AGREED[:2])
-        return depth, confidence
+        return read_agreed(out / name)
 
     records = []
     for span in spans:

@@ -16,7 +16,15 @@ import torch
 from geodiff_plugin._checks import warn
 from geodiff_plugin.formats.lenses import undistorted_pixels
 from geodiff_plugin.messages import Message
-from geodiff_plugin.pose.tracks import FEWEST, LONG_SIDE, Tracks, epipolar, grey_image, sparse_tracks
+from geodiff_plugin.pose.tracks import (
+    FEWEST,
+    LONG_SIDE,
+    Tracks,
+    epipolar,
+    grey_image,
+    rays_through,
+    sparse_tracks,
+)
 from geodiff_plugin.types import Rig
 
 #: Wrong matches lie anywhere, so the better half of all is looked at, by its middle.
@@ -53,12 +61,10 @@ def _matches(left_01: np.ndarray, right_01: np.ndarray) -> tuple[np.ndarray, np.
         image = torch.from_numpy(image_01).permute(2, 0, 1)
         views.append(grey_image(image, torch.eye(3), min(1.0, LONG_SIDE / max(image_01.shape[:2]))))
     tracks = sparse_tracks(views)
-    return _enlarged(tracks.left_px, tracks.K_left), _enlarged(tracks.right_px[0], tracks.K_rights[0])
-
-
-def _enlarged(pixels: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Pixels ``(N, 2)`` of a reduced image on the image itself; ``K`` is what the reduction made of K = 1."""
-    return np.linalg.solve(K, np.c_[pixels, np.ones(len(pixels))].T).T[:, :2]
+    # With K = 1 the rays of the reduced images are pixels of the images themselves.
+    left = rays_through(tracks.left_px, tracks.K_left)
+    right = rays_through(tracks.right_px[0], tracks.K_rights[0])
+    return left[:, :2], right[:, :2]
 
 
 def off_lines_px(rig: Rig, left: np.ndarray, right: np.ndarray) -> float:

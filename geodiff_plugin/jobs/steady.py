@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from geodiff_plugin._checks import InputError
-from geodiff_plugin.capture.results import AGREED, ALONE, FinishedFrame, write_steady
+from geodiff_plugin.capture.results import AGREED, ALONE, FinishedFrame, read_agreed, write_steady
 from geodiff_plugin.formats.out import REPORT, reason_of, write_text
 from geodiff_plugin.jobs.options import DepthOptions
 from geodiff_plugin.jobs.pairs import PairRef, options_of
@@ -56,7 +56,7 @@ def write_steady_frames(
             scenes = write_steady(frames, picture)
         for i, scene in enumerate(scenes):
             if options.into is not None:
-                depth, confidence = (np.load(folders[i] / f"{name}.npy") for name in AGREED[:2])
+                depth, confidence = read_agreed(folders[i])
                 known = depth * (confidence > 0)
                 reports[i]["into"] = write_into(folders[i], known, frames[i].K, options.into)
             note(i, [f"{name}.npy" for name in AGREED], steady={"scene": scene})

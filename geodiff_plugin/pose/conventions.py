@@ -11,6 +11,7 @@ import numpy as np
 from geodiff_plugin.geometry import OPENGL_FROM_OPENCV
 from geodiff_plugin.messages import Message
 from geodiff_plugin.pose.reconstruction import Match
+from geodiff_plugin.pose.tracks import rays_through
 
 #: Matches of a pair that its residual is taken from, at most.
 MOST_PER_PAIR = 100
@@ -128,7 +129,7 @@ def _misfit(E: np.ndarray, K: np.ndarray, matches: Sequence[Match]) -> float:
     ahead, count = 0, 0
     for i, j, px_i, px_j in matches:
         T = np.linalg.inv(E[j]) @ E[i]
-        a, b = (np.linalg.solve(k, np.c_[px, np.ones(len(px))].T).T for k, px in ((K[i], px_i), (K[j], px_j)))
+        a, b = rays_through(px_i, K[i]), rays_through(px_j, K[j])
         a = a @ T[:3, :3].T
         # z_j b = z_i a + t, in the least squares sense, for both depths.
         aa, bb, ab = (a * a).sum(1), (b * b).sum(1), (a * b).sum(1)

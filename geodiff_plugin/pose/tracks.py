@@ -69,6 +69,11 @@ TINY = 1e-12
 GreyImage = tuple[np.ndarray, np.ndarray]
 
 
+def rays_through(pixels: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Rays ``(N, 3)`` with z = 1 through pixels ``(N, 2)`` of a camera ``K (3, 3)``."""
+    return np.linalg.solve(K, np.c_[pixels, np.ones(len(pixels))].T).T
+
+
 @dataclass(frozen=True, eq=False)
 class Tracks:
     """Points seen in the left image and in V right images."""
@@ -85,7 +90,7 @@ class Tracks:
     @cached_property
     def rays(self) -> np.ndarray:
         """``(N, 3)`` left rays with z = 1."""
-        return np.linalg.solve(self.K_left, np.c_[self.left_px, np.ones(len(self))].T).T
+        return rays_through(self.left_px, self.K_left)
 
     def kept(self, mask: np.ndarray | slice) -> Tracks:
         """The tracks of a boolean mask or an index."""
