@@ -55,6 +55,7 @@ def test_the_table_of_launches_is_read_row_by_row():
     assert len(found) == len(rows) > 10
     for launch, row in zip(found, rows, strict=True):
         assert {name: getattr(launch, name) for name in row} == row and len(row) == 4
+        assert launch.module.endswith("kernels")
 
 
 def test_kernels_are_compiled_by_threads_after_the_user_was_told_and_failures_are_left_to_the_call(
@@ -67,14 +68,14 @@ def test_kernels_are_compiled_by_threads_after_the_user_was_told_and_failures_ar
     monkeypatch.setattr(
         _compilation, "ThreadPoolExecutor", lambda count: workers.append(count) or pool(count)
     )
-    for cores in (3, 64):
+    for cores in (3, 64, 1):
         monkeypatch.setattr(_compilation, "available_cores", lambda cores=cores: cores)
         with caplog.at_level(logging.DEBUG, _compilation.__name__):
             compile_kernels(DEVICE, lambda line: told.append((line, len(warmed))))
-    assert workers == [3, 16] and told == [("compiles on cuda:1", 0), ("compiles on cuda:1", 19)]
+    assert workers == [3, 16, 1] and told == [("compiles on cuda:1", made) for made in (0, 19, 38)]
     assert sorted(arguments[0] for arguments, *_ in warmed[:19]) == [n for n in range(20) if n != 7]
     assert {device for *_, device in warmed} == {DEVICE}
-    assert [record.getMessage() for record in caplog.records] == ["one_kernel was not compiled ahead"] * 2
+    assert [record.getMessage() for record in caplog.records] == ["one_kernel was not compiled ahead"] * 3
 
 
 def test_nothing_is_compiled_if_the_cache_has_the_kernels(warmed, monkeypatch):

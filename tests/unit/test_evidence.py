@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -11,11 +10,11 @@ import torch
 from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.algorithm.state import chunk_views
 from geodiff_plugin.algorithm.terms import Given, Objective
-from geodiff_plugin.config import KNOBS, GuidanceConfig
+from geodiff_plugin.config import GuidanceConfig
 from geodiff_plugin.evidence import prepare
 from geodiff_plugin.evidence import store as evidence_store
 from geodiff_plugin.evidence.inputs import Inputs
-from geodiff_plugin.evidence.prepare import make_evidence, prepare_evidence, rows_in_background
+from geodiff_plugin.evidence.prepare import prepare_evidence, rows_in_background
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.geometry import warp_right_to_left
 from geodiff_plugin.matching import Matches
@@ -144,44 +143,6 @@ def test_guidance_asks_the_store_that_it_was_given():
     (shared,), (again,) = guidance.prepare(left[None]), guidance.prepare(left[None])
     assert shared is again is not alone
     assert torch.equal(shared.matches.confidence, alone.matches.confidence)
-
-
-class Watched(GuidanceConfig):
-    """A configuration that notes which of its knobs are read."""
-
-    read: ClassVar[set[str]] = set()
-
-    def __getattribute__(self, name: str):
-        if name in KNOBS:
-            Watched.read.add(name)
-        return super().__getattribute__(name)
-
-
-def test_every_knob_that_evidence_is_made_with_is_told_apart_by_the_store(made):
-    """Those that ``make_evidence`` reads; another value of one of them is another entry."""
-    left, (right, K, T), _, _ = textured_pair((48, 64))
-    (given,) = GeometryGuidance(right, K, torch.linalg.inv(T)).inputs
-    config = Watched()
-    Watched.read.clear()
-    assert config.needs_matches(False)
-    of_needs = set(Watched.read)
-    make_evidence(left, given, config)
-    others = {
-        "pose": "given",
-        "crisp": False,
-        "clean_photographs": False,
-        "depth_range": (0.5, 9.0),
-        "planes": 80,
-        "sweep_pixels": 99_999,
-        "search": "one-number",
-    }
-    assert Watched.read == others.keys() | of_needs, "a knob that changes evidence must be part of the key"
-    store = EvidenceStore(size=20)
-    store.get(left, given, GuidanceConfig())
-    for name, value in others.items():
-        assert getattr(config, name) != value
-        store.get(left, given, GuidanceConfig().changed(**{name: value}))
-    assert len(made) == 1 + len(others)
 
 
 @pytest.mark.parametrize(("of_match", "of_point"), [(0.5, 2.0), (2.0, 0.5), (2.0, None)])

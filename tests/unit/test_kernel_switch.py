@@ -113,7 +113,9 @@ def test_triton_is_there_if_it_can_be_imported(spec, monkeypatch):
     assert _kernels.has_triton.__wrapped__() is (spec is not None) and asked == ["triton"]
 
 
-@pytest.mark.parametrize(("value", "interpreted"), [(None, False), ("0", False), ("1", True)])
+@pytest.mark.parametrize(
+    ("value", "interpreted"), [(None, False), ("0", False), ("true", False), ("1", True)]
+)
 def test_triton_interprets_by_its_environment_variable(value, interpreted, monkeypatch):
     """Then stages take the way of a device, on which launches take the time of small operations."""
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
@@ -129,6 +131,7 @@ def test_triton_interprets_by_its_environment_variable(value, interpreted, monke
     [
         (False, True, True, None, "plain torch: Triton is not installed"),
         (True, True, True, None, "Triton's interpreter, on the CPU"),
+        (True, True, False, None, "Triton's interpreter, on the CPU"),
         (True, False, False, None, "plain torch: kernels need CUDA"),
         (True, False, True, "6.2", "plain torch: kernels need CUDA"),
         (True, False, True, None, "Triton on CUDA, compiled at the first call on a machine"),

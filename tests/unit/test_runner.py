@@ -11,12 +11,10 @@ from collections import Counter
 from contextlib import ExitStack
 
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geodiff_plugin import InputError
-from geodiff_plugin.jobs import many
 from geodiff_plugin.jobs.journal import BROKEN, Item, Journal, Shard, fingerprint
 from geodiff_plugin.jobs.runner import Runner, SideBySide
 from geodiff_plugin.jobs.separate import SeparateProcess
@@ -292,25 +290,6 @@ def test_processes_of_one_machine_are_told_by_torchrun_or_by_its_gpus(
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     assert shard.processes_here(gpus) == processes
-
-
-@pytest.mark.parametrize(
-    ("device", "cores", "pairs", "processes", "count"),
-    [
-        ("cuda", 16, 100, 1, 3),
-        ("cuda", 5, 100, 1, 2),
-        ("cuda", 1, 100, 1, 1),
-        ("cuda", 16, 2, 1, 2),
-        ("cuda", 40, 100, 8, 2),  # eight GPUs of one machine, 5 cores each
-        ("cuda", 16, 100, 8, 1),
-        ("cpu", 16, 9, 1, 0),
-    ],
-)
-def test_no_more_processes_write_than_cores_and_pairs_allow(
-    monkeypatch, device, cores, pairs, processes, count
-):
-    monkeypatch.setattr(many, "available_cores", lambda: cores)
-    assert many.count_writers(torch.device(device), pairs, processes) == count
 
 
 @pytest.mark.parametrize("typed", ["8/8", "1", "-1/3", "1/0", "a/b", ""])

@@ -1,18 +1,20 @@
 """The cache of evidence: another value of any input is another entry, equal values are the same one."""
 
 from dataclasses import fields, replace
-from functools import partial
+from typing import ClassVar
 
 import numpy as np
 import pytest
 import torch
 
+from geodiff_plugin import GeometryGuidance
 from geodiff_plugin.config import KNOBS, Affects, GuidanceConfig, affected
 from geodiff_plugin.evidence import store as module
 from geodiff_plugin.evidence.inputs import Inputs
 from geodiff_plugin.evidence.prepare import make_evidence
 from geodiff_plugin.evidence.store import EvidenceStore
 from geodiff_plugin.types import CameraView
+from tests.benchmarks.matching import textured_pair
 
 #: A second value of every option on which evidence depends; others must not make an entry of their own.
 OPTIONS = {
@@ -43,10 +45,6 @@ def pair():
     )
     points = torch.rand(5, 3, generator=torch.Generator().manual_seed(1))
     return left, Inputs(K, views, ("a rig",), points, "m", False)
-
-
-def to_01(image) -> torch.Tensor:
-    return torch.tensor(np.asarray(image)).permute(2, 0, 1) / 255
 
 
 def variants():
@@ -103,27 +101,26 @@ def test_another_value_of_an_option_is_another_entry_if_evidence_depends_on_it(m
 
 
 class Watched(GuidanceConfig):
-    """A configuration that records which settings are read, but for those that a property reads by itself."""
+    """A configuration that records which of its settings are read."""
 
-    def __getattribute__(self, name):
-        value = super().__getattribute__(name)
+    read: ClassVar[set[str]] = set()
+
+    def __getattribute__(self, name: str):
         if name in KNOBS:
-            super().__getattribute__("__dict__").setdefault("read", set()).add(name)
-        elif name == "needs_matches":  # part of the key as a whole
-            return partial(GuidanceConfig.needs_matches, GuidanceConfig())
-        return value
+            Watched.read.add(name)
+        return super().__getattribute__(name)
 
 
 @pytest.mark.parametrize("pose", ["refine", "given"])
-def test_evidence_reads_no_setting_that_is_not_part_of_the_key(pose, textured_plane):
-    left_01, right_01 = (to_01(image) for image in (textured_plane.left, textured_plane.right))
-    K = torch.tensor(textured_plane.K).float()
-    view = CameraView(right_01, K, torch.tensor(np.linalg.inv(textured_plane.E)).float())
-    config = Watched(pose=pose, sweep_pixels=5000, planes=24)
-    config.__dict__["read"] = set()
-    make_evidence(left_01, Inputs(textured_plane.K, (view,), (), None), config)
-    assert config.__dict__["read"] <= set(OPTIONS)
-    assert {"sweep_pixels", "planes", "pose"} <= config.__dict__["read"]
+def test_evidence_reads_exactly_the_settings_that_are_part_of_the_key(pose):
+    left, (right, K, T), _, _ = textured_pair((48, 64))
+    (given,) = GeometryGuidance(right, K, torch.linalg.inv(T)).inputs
+    config = Watched(pose=pose)
+    Watched.read.clear()
+    assert config.needs_matches(False)  # part of the key as a whole
+    of_needs = set(Watched.read)
+    make_evidence(left, given, config)
+    assert Watched.read == OPTIONS.keys() | of_needs
 
 
 @pytest.mark.parametrize("size", [1, 2, 3])

@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from geodiff_plugin.formats.rigs import CameraChoice
 from geodiff_plugin.types import Rig
 
 K_LEFT = np.array([[811.5, 0, 402.25], [0, 793.25, 305.5], [0, 0, 1]])
@@ -28,6 +29,10 @@ T = np.linalg.inv(E)
 #: Poses of both cameras in a body or world frame.
 BODY_LEFT = pose((-74, 12, 95), (1.3, -0.4, 0.7))
 BODY_RIGHT = BODY_LEFT @ E
+#: Both cameras, the left one first.
+KS, SIZES, LENSES = (K_LEFT, K_RIGHT), (SIZE_LEFT, SIZE_RIGHT), (LENS_LEFT, LENS_RIGHT)
+BODIES = (BODY_LEFT, BODY_RIGHT)
+UNCHOSEN = CameraChoice()
 
 
 def numbers(K) -> list[float]:

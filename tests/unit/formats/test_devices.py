@@ -11,10 +11,11 @@ from geodiff_plugin.formats.rigs import CameraChoice
 from tests.unit.formats.calibrated_pair import (
     K_LEFT,
     K_RIGHT,
-    LENS_LEFT,
-    LENS_RIGHT,
+    KS,
+    LENSES,
     SIZE_LEFT,
     SIZE_RIGHT,
+    SIZES,
     E,
     T,
     assert_is_parallel,
@@ -24,8 +25,6 @@ from tests.unit.formats.calibrated_pair import (
     vector,
     words,
 )
-
-KS, SIZES, LENSES = (K_LEFT, K_RIGHT), (SIZE_LEFT, SIZE_RIGHT), (LENS_LEFT, LENS_RIGHT)
 
 # ZED
 

@@ -64,13 +64,6 @@ def test_frame_and_layout_defaults():
     assert (entry.names_images, entry.has_poses) == (False, True)
 
 
-@pytest.fixture
-def scan(tmp_path):
-    folder = tmp_path / "far below" / "scan"
-    folder.mkdir(parents=True)
-    return folder
-
-
 def build(frame, entry):
     return Candidate(frame, None, f"{frame.name} {entry}")
 

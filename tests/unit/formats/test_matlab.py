@@ -10,11 +10,10 @@ from geodiff_plugin.formats import matlab
 from geodiff_plugin.formats.rigs import CameraChoice
 from tests.unit.formats.calibrated_pair import (
     K_LEFT,
-    K_RIGHT,
-    LENS_LEFT,
+    KS,
     LENS_RIGHT,
-    SIZE_LEFT,
-    SIZE_RIGHT,
+    LENSES,
+    SIZES,
     T,
     assert_is_the_pair,
     numbers,
@@ -22,7 +21,6 @@ from tests.unit.formats.calibrated_pair import (
     words,
 )
 
-KS, SIZES, LENSES = (K_LEFT, K_RIGHT), (SIZE_LEFT, SIZE_RIGHT), (LENS_LEFT, LENS_RIGHT)
 SKEWS = (3.25, -1.75)
 
 

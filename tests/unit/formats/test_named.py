@@ -18,6 +18,7 @@ from tests.unit.formats.calibrated_pair import (
     LENS_LEFT,
     LENS_RIGHT,
     SIZE_LEFT,
+    UNCHOSEN,
     E,
     T,
     assert_is_parallel,
@@ -25,8 +26,6 @@ from tests.unit.formats.calibrated_pair import (
     numbers,
     vector,
 )
-
-UNCHOSEN = CameraChoice()
 
 CAMERAS = {"K1": K_LEFT, "K2": K_RIGHT, "D1": LENS_LEFT[:5], "D2": LENS_RIGHT[:5]}
 POSE = {"R": T[:3, :3], "T": T[:3, 3]}

@@ -19,13 +19,6 @@ def opencv_order(values):
     return [k1, k2, p1, p2, k3]
 
 
-@pytest.fixture
-def scan(tmp_path):
-    folder = tmp_path / "far below" / "scan"
-    folder.mkdir(parents=True)
-    return folder
-
-
 # OpenMVG
 
 

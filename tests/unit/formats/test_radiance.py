@@ -22,14 +22,6 @@ from tests.unit.formats.posed_images import (
 NAMES = ["a.png", "b.png", "c.png"]
 
 
-@pytest.fixture
-def scan(tmp_path):
-    """A folder deep enough that the search for moved images does not reach other tests."""
-    folder = tmp_path / "far below" / "scan"
-    folder.mkdir(parents=True)
-    return folder
-
-
 def splat(n: int) -> dict:
     return {
         "img_name": NAMES[n][0],

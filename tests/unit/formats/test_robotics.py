@@ -10,14 +10,15 @@ from geodiff_plugin._checks import InputError
 from geodiff_plugin.formats import robotics
 from geodiff_plugin.formats.rigs import CameraChoice
 from tests.unit.formats.calibrated_pair import (
-    BODY_LEFT,
-    BODY_RIGHT,
+    BODIES,
     K_LEFT,
     K_RIGHT,
-    LENS_LEFT,
+    KS,
     LENS_RIGHT,
+    LENSES,
     SIZE_LEFT,
-    SIZE_RIGHT,
+    SIZES,
+    UNCHOSEN,
     E,
     T,
     assert_is_parallel,
@@ -27,11 +28,6 @@ from tests.unit.formats.calibrated_pair import (
     quaternion,
     words,
 )
-
-UNCHOSEN = CameraChoice()
-
-KS, SIZES, LENSES = (K_LEFT, K_RIGHT), (SIZE_LEFT, SIZE_RIGHT), (LENS_LEFT, LENS_RIGHT)
-BODIES = (BODY_LEFT, BODY_RIGHT)
 
 
 def kalibr_camera(n: int, count: int = 4, model: str = "radtan") -> dict:

@@ -11,25 +11,23 @@ from geodiff_plugin._checks import InputError
 from geodiff_plugin.formats import slam
 from geodiff_plugin.formats.rigs import CameraChoice
 from tests.unit.formats.calibrated_pair import (
-    BODY_LEFT,
-    BODY_RIGHT,
+    BODIES,
     K_LEFT,
     K_RIGHT,
+    KS,
     LENS_LEFT,
     LENS_RIGHT,
+    LENSES,
     SIZE_LEFT,
     SIZE_RIGHT,
+    SIZES,
+    UNCHOSEN,
     E,
     T,
     assert_is_parallel,
     assert_is_the_pair,
     numbers,
 )
-
-UNCHOSEN = CameraChoice()
-
-KS, SIZES, LENSES = (K_LEFT, K_RIGHT), (SIZE_LEFT, SIZE_RIGHT), (LENS_LEFT, LENS_RIGHT)
-BODIES = (BODY_LEFT, BODY_RIGHT)
 
 
 def read(reader, content, choice=UNCHOSEN):

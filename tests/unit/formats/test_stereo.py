@@ -14,6 +14,7 @@ from tests.unit.formats.calibrated_pair import (
     K_LEFT,
     K_RIGHT,
     SIZE_LEFT,
+    UNCHOSEN,
     E,
     assert_is_parallel,
     assert_is_the_pair,
@@ -21,8 +22,6 @@ from tests.unit.formats.calibrated_pair import (
     pose,
     words,
 )
-
-UNCHOSEN = CameraChoice()
 
 BASELINE = 0.173
 SHIFT = pose((0, 0, 0), (BASELINE, 0, 0))

@@ -43,13 +43,6 @@ def opencv_order(lens):
     return [k1, k2, p1, p2, k3]
 
 
-@pytest.fixture
-def scan(tmp_path):
-    folder = tmp_path / "far below" / "scan"
-    folder.mkdir(parents=True)
-    return folder
-
-
 def write(file, frames, **shared):
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(shared | {"frames": frames}))

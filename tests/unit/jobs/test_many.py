@@ -62,6 +62,13 @@ def test_a_row_says_what_became_of_its_pair():
         ("cuda", 1, 20, 1, 1),
         ("cuda", 9, 20, 4, 2),
         ("cpu", 9, 20, 1, 0),
+        ("cuda", 100, 16, 1, 3),
+        ("cuda", 100, 5, 1, 2),
+        ("cuda", 100, 1, 1, 1),
+        ("cuda", 2, 16, 1, 2),
+        ("cuda", 100, 40, 8, 2),  # eight GPUs of one machine, 5 cores each
+        ("cuda", 100, 16, 8, 1),
+        ("cpu", 9, 16, 1, 0),
     ],
 )
 def test_beside_a_gpu_the_cores_that_its_stages_leave_write(

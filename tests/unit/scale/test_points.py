@@ -10,28 +10,9 @@ from scipy.stats import spearmanr
 from geodiff_plugin.matching import Matches
 from geodiff_plugin.scale import points as p
 from geodiff_plugin.scale.space import MetricMap
+from tests.unit.scale.references import GROWS, TO, metres, tensor
 
-#: What a space is affine in: from metres, and back.
-TO = {
-    "depth": (lambda z: z, lambda v: v),
-    "disparity": (lambda z: 1 / z, lambda v: 1 / v),
-    "log": (np.log, np.exp),
-    "log1p": (np.log1p, np.expm1),
-    "sqrt_disparity": (lambda z: z**-0.5, lambda v: v**-2.0),
-}
-GROWS = ("depth", "log", "log1p")
 SIZE = (24, 36)
-
-
-def tensor(values) -> torch.Tensor:
-    return torch.tensor(np.asarray(values), dtype=torch.float32)
-
-
-def metres(x: np.ndarray, near: float, far: float, space: str) -> np.ndarray:
-    """Depth of a relative map between two ends."""
-    to, back = TO[space]
-    a, b = (to(near), to(far)) if space in GROWS else (to(far), to(near))
-    return back(a + (b - a) * x)
 
 
 def matches_of(inverse: np.ndarray, confidence: np.ndarray, step: float = 0.004) -> Matches:

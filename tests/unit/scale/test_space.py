@@ -14,6 +14,7 @@ from geodiff_plugin.scale.space import (
     joined,
     smooth_floor,
 )
+from tests.unit.scale.references import tensor
 
 #: Metres of ``v = s x + t`` in units of ``g``, as the docstring of ``MetricMap`` has them.
 METRES = {
@@ -25,10 +26,6 @@ METRES = {
 }
 NEAR, FAR = np.array([0.5, 4.0, 0.8]), np.array([0.9, 80.0, 60.0])
 POSITIVE = ("softplus", "square")
-
-
-def tensor(values) -> torch.Tensor:
-    return torch.tensor(np.asarray(values), dtype=torch.float32)
 
 
 def floor(x: np.ndarray) -> np.ndarray:

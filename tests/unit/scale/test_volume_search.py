@@ -8,21 +8,10 @@ import torch
 
 from geodiff_plugin.scale import volume_search as v
 from geodiff_plugin.scale.space import DepthRange
+from tests.unit.scale.references import TO, metres, tensor
 
-TO = {
-    "depth": (lambda z: z, lambda x: x),
-    "disparity": (lambda z: 1 / z, lambda x: 1 / x),
-    "log": (np.log, np.exp),
-    "log1p": (np.log1p, np.expm1),
-    "sqrt_disparity": (lambda z: z**-0.5, lambda x: x**-2.0),
-}
-GROWS = ("depth", "log", "log1p")
 SIZE = (24, 30)
 PLANES = np.linspace(0.02, 0.9, 45)
-
-
-def tensor(values) -> torch.Tensor:
-    return torch.tensor(np.asarray(values), dtype=torch.float32)
 
 
 class Volume:
@@ -42,12 +31,6 @@ class Volume:
     def at_pixels(self, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         rows, columns = at.numpy() // SIZE[1], at.numpy() % SIZE[1]
         return torch.from_numpy(self.cost[:, rows, columns]), torch.from_numpy(self.seen[:, rows, columns])
-
-
-def metres(x: np.ndarray, near, far, space: str) -> np.ndarray:
-    to, back = TO[space]
-    a, b = (to(near), to(far)) if space in GROWS else (to(far), to(near))
-    return back(a + (b - a) * x)
 
 
 class Reference:
